@@ -85,6 +85,16 @@ class LocalMap:
 
 
 @dataclass(frozen=True)
+class FrameObservation:
+    """Building centroids of one frame, (N, 2) metres in the level camera frame (x image right, y up,
+    origin below the camera)."""
+
+    stamp_ns: int
+    centroids_m: FloatArray
+    altitude_m: float
+
+
+@dataclass(frozen=True)
 class Candidate:
     """A ranked hypothesis: where the query-map centre lies in the world (ENU metres of the database
     CRS), the rotation and scale of the similarity map -> world, and its evidence."""
