@@ -1,0 +1,1 @@
+"""Matching of a local building map against a reference database of building footprints."""

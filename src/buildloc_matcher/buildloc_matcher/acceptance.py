@@ -1,0 +1,60 @@
+"""The gate between a ranked candidate and a fix: every refusal says which figure fell short."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from buildloc_msgs_py.types import Candidate
+
+from buildloc_matcher.config import MatcherConfig
+from buildloc_matcher.geometry import wrap
+from buildloc_matcher.refinement import Refined
+from buildloc_matcher.selection import Score
+
+
+def lead(best: Candidate, others: Sequence[Candidate], config: MatcherConfig) -> float:
+    """Ratio of the best MNN-Jaccard to that of the best other pose; infinite without another.
+
+    Another pose is further away than ``rival_distance_m`` or turned by more than twice the rotation
+    tolerance: neighbours of the best bin are the same answer.
+    """
+    turned = math.radians(2.0 * config.rotation_tolerance_deg)
+    rivals = [
+        c.mnn_jaccard
+        for c in others
+        if math.hypot(c.x_m - best.x_m, c.y_m - best.y_m) > config.rival_distance_m
+        or abs(float(wrap(c.yaw_rad - best.yaw_rad))) > turned
+    ]
+    strongest = max(rivals, default=0.0)
+    return best.mnn_jaccard / strongest if strongest > 0.0 else math.inf
+
+
+def acceptance_score(jaccard: float, lead_ratio: float, config: MatcherConfig) -> float:
+    """Evidence over threshold, the weaker of the two: 1 or more passes both."""
+    by_jaccard = jaccard / config.min_jaccard if config.min_jaccard > 0.0 else math.inf
+    return min(by_jaccard, lead_ratio / config.min_lead)
+
+
+def refuse_coarse(score: Score, lead_ratio: float, config: MatcherConfig) -> str | None:
+    """Why the best candidate is not convincing, or None."""
+    if score.jaccard < config.min_jaccard:
+        return f"best candidate has MNN-Jaccard {score.jaccard:.2f}, below {config.min_jaccard:g}"
+    if lead_ratio < config.min_lead:
+        return f"best candidate leads another place only by a factor of {lead_ratio:.2f}, below {config.min_lead:g}"
+    if score.pairs < config.min_pairs:
+        return f"best candidate matches {score.pairs} buildings, fewer than {config.min_pairs}"
+    if score.rms_m > config.max_residual_m:
+        return f"best candidate has residuals of {score.rms_m:.1f} m, above {config.max_residual_m:g} m"
+    return None
+
+
+def refuse_refined(refined: Refined | None, config: MatcherConfig) -> str | None:
+    """Why the refined pose is not convincing, or None."""
+    if refined is None:
+        return "refinement found no buildings of the recent frames in the reference"
+    if refined.buildings < config.min_pairs:
+        return f"refinement matched {refined.buildings} buildings, fewer than {config.min_pairs}"
+    if refined.rms_m > config.max_residual_m:
+        return f"refinement left residuals of {refined.rms_m:.1f} m, above {config.max_residual_m:g} m"
+    return None

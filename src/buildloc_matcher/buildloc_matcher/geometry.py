@@ -1,0 +1,62 @@
+"""Planar similarity transforms. Angles in radians, points (N, 2) in metres."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from buildloc_msgs_py.types import FloatArray
+
+
+def rotation(yaw_rad: float) -> FloatArray:
+    """(2, 2) counter-clockwise rotation."""
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    return np.array([[c, -s], [s, c]])
+
+
+def wrap(angle_rad: FloatArray | float) -> FloatArray:
+    """Wrap to [-pi, pi)."""
+    return np.asarray((np.asarray(angle_rad) + math.pi) % (2.0 * math.pi) - math.pi, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """p_world = anchor_world + scale * R(yaw) @ (p - anchor): all anchors in metres."""
+
+    anchor_m: tuple[float, float]
+    world_m: tuple[float, float]
+    yaw_rad: float
+    scale: float = 1.0
+
+    def apply(self, points_m: FloatArray) -> FloatArray:
+        """(N, 2) -> (N, 2)."""
+        turned = (np.asarray(points_m, dtype=np.float64) - self.anchor_m) @ rotation(self.yaw_rad).T
+        return np.asarray(self.world_m + self.scale * turned, dtype=np.float64)
+
+
+def fit_rigid(source_m: FloatArray, target_m: FloatArray) -> Similarity:
+    """Rotation and translation minimising sum |target - (R source + t)|^2, by SVD (Arun et al. 1987)."""
+    centre_s, centre_t = source_m.mean(axis=0), target_m.mean(axis=0)
+    u, _, vt = np.linalg.svd((source_m - centre_s).T @ (target_m - centre_t))
+    turn = vt.T @ np.diag([1.0, np.sign(np.linalg.det(vt.T @ u.T)) or 1.0]) @ u.T
+    return Similarity(
+        (float(centre_s[0]), float(centre_s[1])),
+        (float(centre_t[0]), float(centre_t[1])),
+        math.atan2(turn[1, 0], turn[0, 0]),
+    )
+
+
+def fit_similarity(source_m: FloatArray, target_m: FloatArray, scale_gate: float) -> Similarity:
+    """The rigid fit with the least-squares scale, held within 1 +- scale_gate."""
+    rigid = fit_rigid(source_m, target_m)
+    centred = source_m - source_m.mean(axis=0)
+    spread = float(np.sum(centred**2))
+    along = float(np.sum((target_m - target_m.mean(axis=0)) * (centred @ rotation(rigid.yaw_rad).T)))
+    scale = along / spread if spread > 0.0 else 1.0
+    return Similarity(
+        rigid.anchor_m,
+        rigid.world_m,
+        rigid.yaw_rad,
+        min(1.0 + scale_gate, max(1.0 - scale_gate, scale)),
+    )

@@ -1,0 +1,102 @@
+"""Multi-frame refinement: recent frames against the reference, pooled, one rigid correction."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from buildloc_msgs_py.types import FloatArray, FrameObservation, Keyframe
+from scipy.spatial import cKDTree
+
+from buildloc_matcher.config import MatcherConfig
+from buildloc_matcher.geometry import Similarity, fit_rigid, rotation
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Camera position of the last keyframe (2,) m and its heading in the world, with the evidence:
+    observations pooled, matched pairs, distinct reference buildings, and the residuals' RMS in m."""
+
+    position_m: FloatArray
+    yaw_rad: float
+    observed: int
+    pairs: int
+    buildings: int
+    rms_m: float
+    variance_m2: float
+
+
+def observed_in_world(
+    coarse: Similarity, keyframes: Sequence[Keyframe], observations: Sequence[FrameObservation], frames: int
+) -> FloatArray:
+    """(N, 2) building centroids of the last frames in the world. The scale within a frame is fixed by
+    its altitude; only the frame's place and heading come from the map and the coarse candidate."""
+    poses = {keyframe.stamp_ns: keyframe for keyframe in keyframes}
+    seen = sorted((o for o in observations if o.stamp_ns in poses), key=lambda o: o.stamp_ns)[-frames:]
+    placed = [np.empty((0, 2))]
+    for observation in seen:
+        pose = poses[observation.stamp_ns]
+        place = coarse.apply(np.array([[pose.x_m, pose.y_m]]))
+        placed.append(place + observation.centroids_m @ rotation(pose.yaw_rad + coarse.yaw_rad).T)
+    return np.concatenate(placed)
+
+
+def refine(
+    coarse: Similarity,
+    keyframes: Sequence[Keyframe],
+    observations: Sequence[FrameObservation],
+    reference_m: FloatArray,
+    tree: cKDTree,
+    config: MatcherConfig,
+) -> Refined | None:
+    """Correct the coarse pose of the last keyframe; None when fewer than three pairs are found.
+
+    1-NN with a distance that shrinks from ``refine_distance_m`` to ``refine_last_distance_m``; every
+    step is one SVD over the pooled pairs of all frames.
+    """
+    if not keyframes:
+        return None
+    last = max(keyframes, key=lambda k: k.stamp_ns)
+    points = observed_in_world(coarse, keyframes, observations, config.refine_frames)
+    position = coarse.apply(np.array([[last.x_m, last.y_m]]))
+    yaw = coarse.yaw_rad + last.yaw_rad
+    if len(points) == 0:
+        return None
+    shrink = np.geomspace(config.refine_distance_m, config.refine_last_distance_m, config.refine_iterations)
+    for distance_m in shrink:
+        distance, nearest = tree.query(points)
+        close = distance < distance_m
+        if close.sum() < 3:
+            return None
+        step = fit_rigid(points[close], reference_m[nearest[close]])
+        points, position, yaw = step.apply(points), step.apply(position), yaw + step.yaw_rad
+    distance, nearest = tree.query(points)
+    close = distance < config.refine_last_distance_m
+    if close.sum() < 3:
+        return None
+    matched = nearest[close]
+    buildings = len(np.unique(matched))
+    rms = math.sqrt(float(np.mean(distance[close] ** 2)))
+    centre = reference_m[matched].mean(axis=0)
+    spread = float(np.mean(np.sum((reference_m[matched] - centre) ** 2, axis=1)))
+    lever = float(np.sum((position[0] - centre) ** 2))
+    variance = rms**2 / math.sqrt(buildings) * (1.0 + lever / max(spread, 1.0))
+    return Refined(
+        position[0],
+        math.atan2(math.sin(yaw), math.cos(yaw)),
+        len(points),
+        int(close.sum()),
+        buildings,
+        rms,
+        variance,
+    )
+
+
+def covariance_enu(refined: Refined, config: MatcherConfig) -> FloatArray:
+    """(3, 3) m2: the residual variance over the square root of the distinct buildings (frames repeat
+    the same buildings, so residuals are not independent), with the lever arm to the camera, inflated,
+    and never below the floor. The altitude is above ground, not above the ellipsoid: wide."""
+    horizontal = max(config.sigma_floor_m**2, config.sigma_inflation**2 * refined.variance_m2)
+    return np.diag([horizontal, horizontal, config.sigma_up_m**2])
