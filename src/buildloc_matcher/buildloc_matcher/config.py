@@ -18,13 +18,19 @@ class MatcherConfig:
     matches_per_star: int = param(50, "best reference matches kept per query star", 1, 10000)
     scale_gate: float = param(0.15, "largest deviation of the map-to-world scale from 1", 0.0, 0.9)
     bin_size_m: float = param(100.0, "side of a voting bin, m", 1.0, 10000.0)
-    rotation_tolerance_deg: float = param(10.0, "half width of a rotation-consistent cluster, deg", 0.1, 180.0)
+    rotation_tolerance_deg: float = param(
+        10.0, "half width of a rotation-consistent cluster, deg", 0.1, 180.0
+    )
     min_votes: int = param(3, "fewest rotation-consistent votes of a candidate", 1, 10000)
     top_k: int = param(20, "candidates rescored by MNN-Jaccard", 1, 1000)
     polish_iterations: int = param(4, "alignment steps of a candidate before it is scored; 0: none", 0, 50)
     mnn_distance_m: float = param(25.0, "largest distance of a mutual nearest-neighbour pair, m", 0.1, 1000.0)
-    observable_margin_m: float = param(15.0, "margin around the hull of the map that was observed, m", 0.0, 1000.0)
-    observable_radius_m: float = param(60.0, "ground around each map building that was observed, m", 1.0, 10000.0)
+    observable_margin_m: float = param(
+        15.0, "margin around the hull of the map that was observed, m", 0.0, 1000.0
+    )
+    observable_radius_m: float = param(
+        60.0, "ground around each map building that was observed, m", 1.0, 10000.0
+    )
     refine_frames: int = param(20, "most recent keyframes used by the refinement", 1, 10000)
     refine_distance_m: float = param(50.0, "1-NN distance of the first refinement step, m", 0.1, 1000.0)
     refine_last_distance_m: float = param(15.0, "1-NN distance of the last refinement step, m", 0.1, 1000.0)

@@ -89,7 +89,9 @@ def assemble(
     epsg: int, centroids_m: FloatArray, areas_m2: FloatArray, shapes: FloatArray, config: MatcherConfig
 ) -> ReferenceDatabase:
     """A database from measured buildings."""
-    return ReferenceDatabase(epsg, centroids_m, areas_m2, shapes, stars(centroids_m, shapes), descriptor_hash(config))
+    return ReferenceDatabase(
+        epsg, centroids_m, areas_m2, shapes, stars(centroids_m, shapes), descriptor_hash(config)
+    )
 
 
 def build(
@@ -125,7 +127,9 @@ def save(database: ReferenceDatabase, path: Path) -> None:
         pa.LargeListArray.from_arrays(pa.array([0, values.size], pa.int64()), pa.array(values.reshape(-1)))
         for values in columns.values()
     ]
-    table = pa.table(dict(zip(columns, arrays, strict=True))).replace_schema_metadata({FORMAT: json.dumps(meta)})
+    table = pa.table(dict(zip(columns, arrays, strict=True))).replace_schema_metadata(
+        {FORMAT: json.dumps(meta)}
+    )
     path = Path(path)
     if not path.parent.is_dir():
         raise DatabaseError(f"{path}: the folder {path.parent} does not exist; make it first")
@@ -165,9 +169,13 @@ def open_database(path: Path, config: MatcherConfig) -> ReferenceDatabase:
         meta = json.loads(metadata[FORMAT.encode()])
         version = meta["version"]
     except (KeyError, ValueError, TypeError) as error:
-        raise DatabaseError(f"{path}: is an Arrow file but not a buildloc reference database; {REBUILD}") from error
+        raise DatabaseError(
+            f"{path}: is an Arrow file but not a buildloc reference database; {REBUILD}"
+        ) from error
     if version != FORMAT_VERSION:
-        raise DatabaseError(f"{path}: reference database has version {version}, not {FORMAT_VERSION}; {REBUILD}")
+        raise DatabaseError(
+            f"{path}: reference database has version {version}, not {FORMAT_VERSION}; {REBUILD}"
+        )
     if meta.get("descriptor_hash") != descriptor_hash(config):
         raise DatabaseError(
             f"{path}: reference database was built with another descriptor configuration "
@@ -175,7 +183,10 @@ def open_database(path: Path, config: MatcherConfig) -> ReferenceDatabase:
         )
     try:
         flat = {name: np.asarray(table.column(name)[0].values) for name in WIDTHS}
-        rows = {name: (values if WIDTHS[name] == 1 else values.reshape(-1, WIDTHS[name])) for name, values in flat.items()}
+        rows = {
+            name: (values if WIDTHS[name] == 1 else values.reshape(-1, WIDTHS[name]))
+            for name, values in flat.items()
+        }
         epsg, buildings, count = int(meta["epsg"]), int(meta["buildings"]), int(meta["stars"])
     except (KeyError, IndexError, ValueError, TypeError) as error:
         raise DatabaseError(f"{path}: reference database is truncated or damaged; {REBUILD}") from error

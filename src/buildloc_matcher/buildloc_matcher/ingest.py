@@ -44,7 +44,9 @@ def read_geometries(path: Path) -> gpd.GeoSeries:
     Raises IngestError when the file is missing, unreadable or holds no geometry.
     """
     if not path.is_file():
-        raise IngestError(f"{path}: no such footprint file; give a GeoJSON or GeoParquet of building polygons")
+        raise IngestError(
+            f"{path}: no such footprint file; give a GeoJSON or GeoParquet of building polygons"
+        )
     try:
         if path.suffix.lower() in PARQUET_SUFFIXES:
             frame = gpd.read_parquet(path)
@@ -83,7 +85,9 @@ def polygons(geometry: gpd.GeoSeries, source: str) -> tuple[gpd.GeoSeries, dict[
     }
     if not keep.any():
         found = sorted({str(g.geom_type) for g in values}) or ["only empty geometries"]
-        raise IngestError(f"{source}: has no building polygon ({', '.join(found)}); give a file with polygons")
+        raise IngestError(
+            f"{source}: has no building polygon ({', '.join(found)}); give a file with polygons"
+        )
     return gpd.GeoSeries(values[keep], crs=geometry.crs), counts
 
 
@@ -131,7 +135,9 @@ def ingest(
     epsg = utm_epsg(center_deg[1], center_deg[0])
     metric = degrees.to_crs(epsg).to_numpy()
     if radius_km is not None:
-        origin = Transformer.from_crs(CRS(WGS84), CRS(epsg), always_xy=True).transform(center_deg[1], center_deg[0])
+        origin = Transformer.from_crs(CRS(WGS84), CRS(epsg), always_xy=True).transform(
+            center_deg[1], center_deg[0]
+        )
         middle = shapely.get_coordinates(shapely.centroid(metric))
         inside = np.hypot(middle[:, 0] - origin[0], middle[:, 1] - origin[1]) <= radius_km * 1000.0
         counts["outside"] = int((~inside).sum())

@@ -65,16 +65,19 @@ class Matcher:
         centre = points.mean(axis=0)
         query = stars(points, shapes)
         matches = match_stars(query, database.index, config)
-        hypotheses = hypothesize(
-            matches, query, points, database.stars, database.centroids_m, centre, config
-        )
+        hypotheses = hypothesize(matches, query, points, database.stars, database.centroids_m, centre, config)
         ballot = vote(hypotheses, config)
         scores = []
         for cluster in ballot.clusters[: config.top_k]:
             start = Similarity(
-                (float(centre[0]), float(centre[1])), (cluster.x_m, cluster.y_m), cluster.yaw_rad, cluster.scale
+                (float(centre[0]), float(centre[1])),
+                (cluster.x_m, cluster.y_m),
+                cluster.yaw_rad,
+                cluster.scale,
             )
-            scores.append((cluster, score_candidate(start, points, database.centroids_m, database.tree, config)))
+            scores.append(
+                (cluster, score_candidate(start, points, database.centroids_m, database.tree, config))
+            )
         scores.sort(key=lambda pair: (-pair[1].jaccard, -pair[0].votes))
         ranked = [self._candidate(score, cluster.votes, centre) for cluster, score in scores]
         if ranked:
@@ -120,7 +123,9 @@ class Matcher:
             return Answer(NoFix(local_map.stamp_ns, reason), found.candidates, funnel)
 
         if funnel["buildings"] < self.config.min_buildings:
-            return none(f"map has {funnel['buildings']:.0f} buildings, fewer than {self.config.min_buildings}")
+            return none(
+                f"map has {funnel['buildings']:.0f} buildings, fewer than {self.config.min_buildings}"
+            )
         if not keyframes:
             return none("no keyframes yet")
         if not found.candidates:

@@ -36,7 +36,9 @@ def mutual_pairs(query_m: FloatArray, reference_m: FloatArray, max_distance_m: f
     return np.column_stack([queries[mutual], to_reference[mutual]]).astype(np.int64)
 
 
-def observable(query_m: FloatArray, reference_m: FloatArray, margin_m: float, radius_m: float) -> NDArray[np.int64]:
+def observable(
+    query_m: FloatArray, reference_m: FloatArray, margin_m: float, radius_m: float
+) -> NDArray[np.int64]:
     """Indices of the reference buildings the map should have seen: inside the hull of the map
     buildings grown by the margin, and within the radius of one of them (a flight along an L does not
     see the inside of its hull)."""

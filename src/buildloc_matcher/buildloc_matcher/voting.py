@@ -68,7 +68,12 @@ def vote(hypotheses: Hypotheses, config: MatcherConfig) -> Ballot:
         scale = np.average(hypotheses.scales[group], weights=weights)
         clusters.append(
             Cluster(
-                float(position[0]), float(position[1]), float(yaw), float(scale), float(weights.sum()), len(group)
+                float(position[0]),
+                float(position[1]),
+                float(yaw),
+                float(scale),
+                float(weights.sum()),
+                len(group),
             )
         )
     clusters.sort(key=lambda c: (-c.votes, c.x_m, c.y_m))

@@ -37,7 +37,9 @@ def buildings(seed: int, count: int, side_m: float) -> tuple[np.ndarray, np.ndar
     rows = []
     for x, y in points:
         width, length = rng.uniform(7.0, 14.0), rng.uniform(9.0, 28.0)
-        outline = affinity.rotate(box(x - width / 2, y - length / 2, x + width / 2, y + length / 2), rng.uniform(0, 180))
+        outline = affinity.rotate(
+            box(x - width / 2, y - length / 2, x + width / 2, y + length / 2), rng.uniform(0, 180)
+        )
         rows.append((footprint(outline).area_m2, *footprint(outline).shape))
     table = np.array(rows)
     return points, table[:, 0], table[:, 1:]
@@ -79,8 +81,15 @@ def test_matching_equals_the_oracle() -> None:
 
 
 @settings(max_examples=25, deadline=None)
-@given(yaw=st.floats(-math.pi, math.pi), x=st.floats(-1e5, 1e5), y=st.floats(-1e5, 1e5), seed=st.integers(0, 1000))
-def test_descriptors_do_not_change_with_rotation_shift_and_order(yaw: float, x: float, y: float, seed: int) -> None:
+@given(
+    yaw=st.floats(-math.pi, math.pi),
+    x=st.floats(-1e5, 1e5),
+    y=st.floats(-1e5, 1e5),
+    seed=st.integers(0, 1000),
+)
+def test_descriptors_do_not_change_with_rotation_shift_and_order(
+    yaw: float, x: float, y: float, seed: int
+) -> None:
     points, _, shapes = buildings(3, 60, 350.0)
     order = np.random.default_rng(seed).permutation(len(points))
     moved = (points @ rotation(yaw).T + [x, y])[order]
@@ -149,7 +158,9 @@ def test_mutual_pairs_and_jaccard_by_hand() -> None:
 def test_fits_recover_known_motions() -> None:
     points = buildings(5, 20, 200.0)[0]
     truth = Similarity((10.0, 20.0), (70.0, -5.0), -2.0, 1.0)
-    np.testing.assert_allclose(fit_rigid(points, truth.apply(points)).apply(points), truth.apply(points), atol=1e-9)
+    np.testing.assert_allclose(
+        fit_rigid(points, truth.apply(points)).apply(points), truth.apply(points), atol=1e-9
+    )
     scaled = Similarity((10.0, 20.0), (70.0, -5.0), 1.0, 1.07)
     assert fit_similarity(points, scaled.apply(points), 0.15).scale == pytest.approx(1.07)
     assert fit_similarity(points, scaled.apply(points), 0.05).scale == pytest.approx(1.05)
@@ -218,7 +229,9 @@ def test_a_noisy_map_is_located_within_5_m(seed: int) -> None:
     matcher = Matcher(assemble(EPSG, CITY[0] + shift, CITY[1], CITY[2], CONFIG), CONFIG)
     answer = matcher.fix(local_map, poses, seen)
     assert isinstance(answer.result, Fix), answer
-    error = math.hypot(answer.result.easting_m - truth[0] - shift[0], answer.result.northing_m - truth[1] - shift[1])
+    error = math.hypot(
+        answer.result.easting_m - truth[0] - shift[0], answer.result.northing_m - truth[1] - shift[1]
+    )
     assert error < 5.0
     assert answer.result.stamp_ns == local_map.stamp_ns and answer.result.altitude_m == 105.0
     assert answer.candidates[0].acceptance >= 1.0
@@ -239,7 +252,12 @@ def test_small_maps_say_why_there_is_no_fix() -> None:
     matcher = Matcher(assemble(EPSG, *CITY, CONFIG), CONFIG)
     for count in (0, 3, 8):
         some = LocalMap(
-            5, np.arange(count), CITY[0][:count], CITY[1][:count], CITY[2][:count], np.ones(count, dtype=np.int64)
+            5,
+            np.arange(count),
+            CITY[0][:count],
+            CITY[1][:count],
+            CITY[2][:count],
+            np.ones(count, dtype=np.int64),
         )
         answer = matcher.fix(some, [Keyframe(5, 0.0, 0.0, 0.0)], [])
         assert isinstance(answer.result, NoFix) and "fewer than 12" in answer.result.reason
