@@ -35,7 +35,7 @@ class DatabaseError(BuildlocError):
     """A reference database cannot be used."""
 
 
-class DatabaseMissing(DatabaseError):
+class DatabaseMissingError(DatabaseError):
     """There is no such file."""
 
 
@@ -150,12 +150,12 @@ def save(database: ReferenceDatabase, path: Path) -> None:
 def open_database(path: Path, config: MatcherConfig) -> ReferenceDatabase:
     """Read a database made with the same descriptor configuration.
 
-    Raises DatabaseMissing, or DatabaseError for a file that is foreign, truncated, of another version
+    Raises DatabaseMissingError, or DatabaseError for a file that is foreign, truncated, of another version
     or of another descriptor configuration.
     """
     path = Path(path)
     if not path.is_file():
-        raise DatabaseMissing(f"{path}: no such reference database; {REBUILD}")
+        raise DatabaseMissingError(f"{path}: no such reference database; {REBUILD}")
     with path.open("rb") as file:
         head = file.read(len(MAGIC))
     if head != MAGIC:

@@ -35,7 +35,7 @@ def _complex(points_m: FloatArray) -> np.ndarray:
 def _orientation(corners: np.ndarray) -> np.ndarray:
     """Sign of the signed area of triangles (M, 3) of complex corners."""
     one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    return np.sign((np.conj(one) * two).imag)
+    return np.asarray(np.sign((np.conj(one) * two).imag))
 
 
 def hypothesize(

@@ -1,0 +1,205 @@
+"""Ingest and the database file: every bad footprint file and every bad database, one clear line each."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import geopandas as gpd
+import numpy as np
+import pyarrow as pa
+import pytest
+from buildloc_matcher.config import MatcherConfig
+from buildloc_matcher.database import DatabaseError, DatabaseMissingError, build, open_database, save
+from buildloc_matcher.ingest import IngestError, ingest
+from buildloc_matcher.matcher import Matcher
+from buildloc_msgs_py.errors import BuildlocError
+from shapely.geometry import LineString, MultiPolygon, Point, Polygon, box
+
+CONFIG = MatcherConfig()
+UTM = 32619
+ORIGIN = (330_000.0, 4_700_000.0)
+
+
+def houses(rows: int = 5) -> list[Polygon]:
+    """A crooked grid of rectangles in UTM metres."""
+    x0, y0 = ORIGIN
+    return [
+        box(x0 + 40 * i + 3 * j, y0 + 45 * j + i * i, x0 + 40 * i + 3 * j + 10 + j, y0 + 45 * j + i * i + 12)
+        for i in range(rows)
+        for j in range(rows)
+    ]
+
+
+def write(path: Path, geometry: list[object], crs: int | None = 4326) -> Path:
+    frame = gpd.GeoDataFrame(geometry=geometry, crs=UTM if crs is not None else None)
+    if crs is not None:
+        frame = frame.to_crs(crs)
+    if path.suffix == ".parquet":
+        frame.to_parquet(path)
+    else:
+        frame.to_file(path, driver="GeoJSON")
+    return path
+
+
+def one_line(error: BaseException) -> str:
+    assert isinstance(error, BuildlocError) and "\n" not in str(error) and str(error)
+    return str(error)
+
+
+@pytest.mark.parametrize("name", ["a.geojson", "a.parquet"])
+@pytest.mark.parametrize("crs", [4326, 3857, UTM])
+def test_any_crs_gives_the_same_buildings(tmp_path: Path, name: str, crs: int) -> None:
+    found = ingest([write(tmp_path / name, houses(), crs)], 20.0)
+    assert found.epsg == UTM and found.counts["used"] == 25
+    expected = [(p.centroid.x, p.centroid.y) for p in houses()]
+    np.testing.assert_allclose(found.centroids_m, expected, atol=0.02)
+    np.testing.assert_allclose(found.areas_m2, [p.area for p in houses()], rtol=2e-3)
+
+
+def test_center_and_radius_cut_the_city(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.parquet", houses(), UTM)
+    middle = gpd.GeoSeries([Point(*ORIGIN)], crs=UTM).to_crs(4326)[0]
+    found = ingest([path], 20.0, (middle.y, middle.x), 0.1)
+    assert 1 < found.counts["used"] < 25 and found.counts["outside"] == 25 - found.counts["used"]
+    with pytest.raises(IngestError) as error:
+        ingest([path], 20.0, (10.0, 10.0), 1.0)
+    assert "no building within 1 km" in one_line(error.value)
+    with pytest.raises(IngestError) as error:
+        ingest([path], 20.0, (10.0, 10.0), -1.0)
+    assert "not positive" in one_line(error.value)
+
+
+def test_invalid_geometry_is_repaired_and_the_rest_counted(tmp_path: Path) -> None:
+    x, y = ORIGIN
+    bow_tie = Polygon([(x, y - 90), (x + 20, y - 70), (x + 20, y - 90), (x, y - 70)])
+    pair = MultiPolygon([box(x, y - 200, x + 10, y - 190), box(x + 50, y - 200, x + 60, y - 190)])
+    shed = box(x, y - 300, x + 2, y - 298)
+    geometry = [
+        *houses(),
+        bow_tie,
+        pair,
+        shed,
+        Point(x, y),
+        LineString([(x, y), (x + 5, y)]),
+        Polygon(),
+        None,
+    ]
+    found = ingest([write(tmp_path / "a.parquet", geometry, UTM)], 20.0)
+    assert found.counts == {
+        "read": 32,
+        "empty": 2,
+        "repaired": 1,
+        "not_polygon": 2,
+        "small": 1,
+        "unusable": 0,
+        "used": 25 + 2 + 2,
+    }
+
+
+@pytest.mark.parametrize(
+    "geometry", [[Point(*ORIGIN)], [LineString([ORIGIN, (0.0, 0.0)])], [Polygon()], [None]]
+)
+def test_no_polygon_at_all_is_an_error(tmp_path: Path, geometry: list[object]) -> None:
+    with pytest.raises(IngestError) as error:
+        ingest([write(tmp_path / "a.parquet", geometry, UTM)], 20.0)
+    assert "no building polygon" in one_line(error.value)
+
+
+def test_bad_footprint_files_say_what_is_wrong(tmp_path: Path) -> None:
+    cases: list[tuple[Path, str]] = [(tmp_path / "absent.geojson", "no such footprint file")]
+    (tmp_path / "garbage.geojson").write_text("not a map")
+    (tmp_path / "garbage.parquet").write_text("not a map")
+    (tmp_path / "none.geojson").write_text('{"type": "FeatureCollection", "features": []}')
+    half = write(tmp_path / "half.parquet", houses(), UTM)
+    half.write_bytes(half.read_bytes()[:-100])
+    metres = {"type": "Feature", "properties": {}, "geometry": houses()[0].__geo_interface__}
+    (tmp_path / "metres.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [metres]}))
+    cases += [
+        (tmp_path / "garbage.geojson", "not a readable"),
+        (tmp_path / "garbage.parquet", "not a readable"),
+    ]
+    cases += [(half, "not a readable"), (tmp_path / "none.geojson", "no geometry")]
+    cases += [(tmp_path / "metres.geojson", "do not fit its CRS")]
+    cases += [(write(tmp_path / "plain.parquet", houses(), None), "no coordinate reference system")]
+    for path, text in cases:
+        with pytest.raises(IngestError) as error:
+            ingest([path], 20.0)
+        assert text in one_line(error.value) and str(path) in str(error.value)
+    with pytest.raises(IngestError):
+        ingest([], 20.0)
+    with pytest.raises(IngestError) as error:
+        ingest([write(tmp_path / "small.geojson", houses())], 5000.0)
+    assert "lower min_area_m2" in one_line(error.value)
+
+
+def test_a_database_survives_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "reference.arrow"
+    made = build([write(tmp_path / "a.geojson", houses())], CONFIG)
+    save(made, path)
+    read = open_database(path, CONFIG)
+    assert (read.epsg, len(read), len(read.stars)) == (UTM, 25, len(made.stars)) and len(made.stars) > 5
+    assert read.bounds_m == made.bounds_m
+    np.testing.assert_array_equal(read.centroids_m, made.centroids_m)
+    np.testing.assert_array_equal(read.stars.features, made.stars.features)
+    np.testing.assert_array_equal(read.stars.triangles, made.stars.triangles)
+    latitude, longitude = read.to_wgs84(*ORIGIN)
+    assert (latitude, longitude) == pytest.approx((42.433, -71.066), abs=0.01)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.geojson", "reference.arrow"]
+    with pytest.raises(DatabaseError) as error:
+        save(made, tmp_path / "nowhere" / "reference.arrow")
+    assert "does not exist" in one_line(error.value)
+
+
+def test_bad_databases_are_refused_with_one_line(tmp_path: Path) -> None:
+    good = tmp_path / "good.arrow"
+    made = build([write(tmp_path / "a.geojson", houses())], CONFIG)
+    save(made, good)
+    with pytest.raises(DatabaseMissingError) as missing:
+        open_database(tmp_path / "absent.arrow", CONFIG)
+    assert "no such reference database" in one_line(missing.value)
+
+    def refused(content: bytes) -> str:
+        bad = tmp_path / "bad.arrow"
+        bad.write_bytes(content)
+        with pytest.raises(DatabaseError) as error:
+            open_database(bad, CONFIG)
+        assert "refdb build" in str(error.value) and str(bad) in str(error.value)
+        return one_line(error.value)
+
+    whole = good.read_bytes()
+    for kept in (6, 10, 200, len(whole) // 2, len(whole) - 8, len(whole) - 1):
+        assert "truncated" in refused(whole[:kept])
+    assert "not a buildloc reference database" in refused(b"")
+    assert "not a buildloc reference database" in refused(b"PK\x03\x04 something else")
+    foreign = pa.BufferOutputStream()
+    with pa.ipc.new_file(foreign, pa.schema([("a", pa.int64())])):
+        pass
+    assert "not a buildloc reference database" in refused(foreign.getvalue().to_pybytes())
+
+    table = pa.ipc.open_file(whole).read_all()
+    meta = json.loads(table.schema.metadata[b"buildloc-reference"])
+
+    def changed(**values: object) -> bytes:
+        sink = pa.BufferOutputStream()
+        other = table.replace_schema_metadata({"buildloc-reference": json.dumps(meta | values)})
+        with pa.ipc.new_file(sink, other.schema) as writer:
+            writer.write_table(other)
+        return bytes(sink.getvalue().to_pybytes())
+
+    assert "has version 99" in refused(changed(version=99))
+    assert "another descriptor configuration" in refused(changed(descriptor_hash="0" * 16))
+    assert "damaged" in refused(changed(stars=3))
+    assert "damaged" in refused(changed(buildings="many"))
+
+
+def test_another_descriptor_configuration_is_refused(tmp_path: Path) -> None:
+    path, other = tmp_path / "reference.arrow", MatcherConfig(min_area_m2=40.0)
+    save(build([write(tmp_path / "a.geojson", houses())], CONFIG), path)
+    with pytest.raises(DatabaseError) as error:
+        open_database(path, other)
+    assert "another descriptor configuration" in one_line(error.value)
+    with pytest.raises(DatabaseError):
+        Matcher(open_database(path, CONFIG), other)
+    open_database(path, dataclasses.replace(CONFIG, min_votes=5))
