@@ -1,0 +1,131 @@
+"""From pixels to metres on the ground: tilt, ground sampling distance, outlines.
+
+The level camera frame has its origin below the camera, x to image right, y to image up, in metres.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from shapely.geometry import Polygon
+
+from buildloc_msgs_py.errors import BuildlocError
+from buildloc_msgs_py.types import ByteArray, CameraModel, FloatArray, Frame, FrameObservation
+from buildloc_msgs_py.wire import WireError
+
+Quaternion = tuple[float, float, float, float]
+
+
+def rotation_matrix(attitude_xyzw: Quaternion) -> FloatArray:
+    """(3, 3) rotation of a unit quaternion (x, y, z, w)."""
+    x, y, z, w = attitude_xyzw
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def heading_rad(attitude_xyzw: Quaternion) -> float:
+    """In-plane rotation of the camera about the vertical, radians, clockwise seen from above."""
+    x_axis = rotation_matrix(attitude_xyzw)[:, 0]
+    return math.atan2(x_axis[1], x_axis[0])
+
+
+def level_matrix(attitude_xyzw: Quaternion) -> FloatArray:
+    """(3, 3) rotation that takes camera axes to level axes by tilt alone: the heading is removed.
+
+    Raises BuildlocError when the camera does not look down (tilt above 60 degrees).
+    """
+    down = rotation_matrix(attitude_xyzw)[2, :]  # the vertical, seen from the camera
+    if down[2] < 0.5:
+        raise BuildlocError("the camera looks more than 60 degrees away from the ground; point the gimbal down")
+    axis = np.cross(down, [0.0, 0.0, 1.0])
+    skew = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
+    return np.asarray(np.eye(3) + skew + skew @ skew / (1.0 + down[2]), dtype=np.float64)
+
+
+def camera_matrix(camera: CameraModel) -> FloatArray:
+    """(3, 3) intrinsic matrix."""
+    return np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+
+
+def pixels_to_level(
+    uv: FloatArray, camera: CameraModel, altitude_m: float, attitude_xyzw: Quaternion
+) -> FloatArray:
+    """(N, 2) pixels -> (N, 2) metres in the level camera frame."""
+    rays = np.column_stack([(uv - [camera.cx, camera.cy]) / [camera.fx, camera.fy], np.ones(len(uv))])
+    level = rays @ level_matrix(attitude_xyzw).T
+    ground = level[:, :2] / level[:, 2:] * altitude_m
+    return np.asarray(ground * [1.0, -1.0], dtype=np.float64)
+
+
+def rectify(
+    image: ByteArray, camera: CameraModel, attitude_xyzw: Quaternion, interpolation: int = cv2.INTER_LINEAR
+) -> ByteArray:
+    """The image as a camera of the same intrinsics would have taken it looking straight down."""
+    k = camera_matrix(camera)
+    homography = k @ level_matrix(attitude_xyzw) @ np.linalg.inv(k)
+    warped = cv2.warpPerspective(image, homography, (camera.width, camera.height), flags=interpolation)
+    return np.asarray(warped, dtype=np.uint8)
+
+
+def validate_frame(frame: Frame) -> None:
+    """Raise WireError for an altitude that is no height or an image of another size than camera_info's."""
+    if not (math.isfinite(frame.altitude_m) and frame.altitude_m > 0.0):
+        raise WireError(f"altitude {frame.altitude_m} m is not a positive number; check the altitude source")
+    height, width = frame.image_bgr.shape[:2]
+    if (width, height) != (frame.camera.width, frame.camera.height):
+        raise WireError(
+            f"image is {width}x{height} but camera_info says {frame.camera.width}x{frame.camera.height}; "
+            "publish the calibration of this resolution"
+        )
+
+
+@dataclass(frozen=True)
+class _Shift:
+    gsd_m: float
+    centre_uv: tuple[float, float]
+
+
+def _polygon(contour: NDArray[np.int32], shift: _Shift) -> Polygon | None:
+    if len(contour) < 3:
+        return None
+    uv = contour.reshape(-1, 2).astype(np.float64)
+    xy = (uv - shift.centre_uv) * [shift.gsd_m, -shift.gsd_m]
+    # Contours run through pixel centres; half a pixel outwards gives the pixels' own outline.
+    polygon = Polygon(xy).buffer(0.5 * shift.gsd_m, join_style="mitre")
+    return polygon if isinstance(polygon, Polygon) and polygon.is_valid else None
+
+
+def outlines(mask_pixels: ByteArray, gsd_m: float, min_area_m2: float) -> list[Polygon]:
+    """Connected components of a mask as polygons in metres, y up, origin at the image centre."""
+    height, width = mask_pixels.shape
+    shift = _Shift(gsd_m, ((width - 1) / 2.0, (height - 1) / 2.0))
+    contours, _ = cv2.findContours(mask_pixels, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    polygons = (_polygon(np.asarray(c, dtype=np.int32), shift) for c in contours)
+    return [p for p in polygons if p is not None and p.area >= min_area_m2]
+
+
+def observe(
+    mask_pixels: ByteArray,
+    stamp_ns: int,
+    camera: CameraModel,
+    altitude_m: float,
+    attitude_xyzw: Quaternion,
+    min_area_m2: float,
+) -> FrameObservation:
+    """Centroids of the buildings of one frame that do not touch the image's border."""
+    height, width = mask_pixels.shape
+    gsd = altitude_m / camera.fx
+    _, _, stats, centroids = cv2.connectedComponentsWithStats(mask_pixels, connectivity=8)
+    x, y, w, h, area = stats[1:].T
+    inside = (x > 0) & (y > 0) & (x + w < width) & (y + h < height) & (area * gsd * gsd >= min_area_m2)
+    uv = np.asarray(centroids[1:][inside], dtype=np.float64)
+    return FrameObservation(stamp_ns, pixels_to_level(uv, camera, altitude_m, attitude_xyzw), altitude_m)
