@@ -7,10 +7,10 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from buildloc_msgs_py.errors import BuildlocError
-from buildloc_msgs_py.types import CameraModel, FrameObservation, Keyframe, LocalMap, Mask, NoFix
+from buildloc_msgs_py.types import ByteArray, CameraModel, FrameObservation, Keyframe, LocalMap, Mask, NoFix
 
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.database import open_database
@@ -18,7 +18,7 @@ from buildloc_matcher.matcher import Answer, Matcher
 
 T = TypeVar("T")
 Attitude = tuple[float, float, float, float]
-Observe = Callable[[Mask, CameraModel, float, Attitude, float], FrameObservation]
+Observe = Callable[[ByteArray, int, CameraModel, float, Attitude, float], FrameObservation]
 
 SLOP_NS = 50_000_000
 MAX_AGE_NS = 2_000_000_000
@@ -62,7 +62,8 @@ class Session:
         self.database_path = ""
         self.reason = "no reference database: set the parameter `database` or call /buildloc/reference/load"
         self.latest_stamp_ns = 0
-        self.frames_without_telemetry = 0
+        self.telemetry_fault = ""
+        self.frames_unusable = 0
         self.maps_skipped = 0
         self._observe = observe
         self._frames: dict[int, FrameObservation | None] = {}
@@ -84,11 +85,21 @@ class Session:
         """What a keyframe saw; a mask without its telemetry counts as seen, with nothing in it."""
         self.latest_stamp_ns = mask.stamp_ns
         altitude, attitude = self.altitudes.at(mask.stamp_ns), self.attitudes.at(mask.stamp_ns)
+        camera = self.camera
         seen: FrameObservation | None = None
-        if self.camera is None or altitude is None or attitude is None:
-            self.frames_without_telemetry += 1
+        self.telemetry_fault = ""
+        if camera is None or altitude is None or attitude is None:
+            named = (("camera info", camera), ("altitude", altitude), ("gimbal attitude", attitude))
+            missing = ", ".join(name for name, value in named if value is None)
+            self.telemetry_fault = f"no {missing} for the image; check that it is published and its stamps"
+        elif mask.pixels.shape != (camera.height, camera.width):
+            size = f"{mask.pixels.shape[1]}x{mask.pixels.shape[0]}"
+            self.telemetry_fault = f"mask is {size}, camera_info says {camera.width}x{camera.height}"
         else:
-            seen = self._observe(mask, self.camera, altitude, attitude, self.config.min_area_m2)
+            seen = self._observe(
+                mask.pixels, mask.stamp_ns, camera, altitude, attitude, self.config.min_area_m2
+            )
+        self.frames_unusable += seen is None
         self._frames[mask.stamp_ns] = seen
         while len(self._frames) > 4 * self.config.refine_frames:
             del self._frames[next(iter(self._frames))]
@@ -108,9 +119,10 @@ class Session:
         return self._complete(stamp_ns)
 
     def _complete(self, stamp_ns: int) -> Job | None:
-        for pending in (self._maps, self._keyframes):
+        waiting: tuple[dict[int, Any], ...] = (self._maps, self._keyframes)
+        for pending in waiting:
             while len(pending) > PENDING:
-                del pending[next(iter(pending))]  # type: ignore[attr-defined]
+                pending.pop(next(iter(pending)))
                 self.maps_skipped += 1
         if stamp_ns not in self._maps or stamp_ns not in self._keyframes or stamp_ns not in self._frames:
             return None
@@ -127,4 +139,5 @@ class Session:
 
     def waiting(self) -> NoFix:
         """No position right now, at the capture time of the latest image."""
-        return NoFix(self.latest_stamp_ns, self.reason)
+        fault = self.telemetry_fault if self.matcher is not None else ""
+        return NoFix(self.latest_stamp_ns, fault or self.reason)

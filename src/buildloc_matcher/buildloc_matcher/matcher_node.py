@@ -1,0 +1,145 @@
+"""/buildloc/map, keyframes and mask in; candidates, fix and pose out.
+
+An accepted fix is published exactly once, with the capture time of its image. While there is none,
+NO_FIX goes out at 1 Hz and /diagnostics says why. Solving runs on one worker thread, so that a slow
+solve never stops the NO_FIX.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any
+
+from buildloc_msgs_py import encode, ground, qos, topics, wire
+from buildloc_msgs_py.ros_node import Diagnostics, declare_config, run_node
+from buildloc_msgs_py.types import Fix
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped, QuaternionStamped
+from nav_msgs.msg import Path
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo, Image, NavSatFix, PointCloud2, Range
+from std_msgs.msg import String
+
+from buildloc_matcher.config import MatcherConfig
+from buildloc_matcher.session import Job, Session
+
+NO_FIX_PERIOD_S = 1.0
+
+
+class MatcherNode(Node):  # type: ignore[misc]
+    """Answers every map with a fix or a reason."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("matcher_node", **kwargs)
+        self.session = Session(declare_config(self, MatcherConfig), ground.observe)
+        self.diagnostics = Diagnostics(self)
+        self._lock = threading.Lock()
+        self._worker = ThreadPoolExecutor(1, "solve")
+        self._fixed = False
+        self._fixes = 0
+        self._funnel: dict[str, float] = {}
+        self._candidates = self.create_publisher(PointCloud2, topics.CANDIDATES, qos.SENSOR)
+        self._fix = self.create_publisher(NavSatFix, topics.FIX, qos.SENSOR)
+        self._pose = self.create_publisher(PoseWithCovarianceStamped, topics.POSE, qos.SENSOR)
+        for kind, topic, profile, handle in (
+            (CameraInfo, topics.CAMERA_INFO, qos.SENSOR, self._on_camera_info),
+            (Range, topics.ALTITUDE, qos.SENSOR, self._on_altitude),
+            (QuaternionStamped, topics.GIMBAL_ATTITUDE, qos.SENSOR, self._on_attitude),
+            (Image, topics.MASK, qos.SENSOR, self._on_mask),
+            (PointCloud2, topics.MAP, qos.SENSOR, self._on_map),
+            (Path, topics.KEYFRAMES, qos.SENSOR, self._on_keyframes),
+            (String, topics.REFERENCE_DATABASE, qos.LATCHED, self._on_database),
+        ):
+            self.create_subscription(kind, topic, partial(self._guarded, handle), profile)
+        database = str(self.declare_parameter("database", "").value)
+        if database:
+            self._worker.submit(self._load, database)
+        self.create_timer(NO_FIX_PERIOD_S, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def _guarded(self, handle: Callable[[Any], None], message: Any) -> None:
+        try:
+            handle(message)
+        except wire.WireError as error:
+            self.diagnostics.report(DiagnosticStatus.WARN, str(error))
+
+    def _on_camera_info(self, message: CameraInfo) -> None:
+        self.session.camera = wire.decode_camera_info(message)
+
+    def _on_altitude(self, message: Range) -> None:
+        self.session.altitudes.add(wire.stamp_ns(message), wire.decode_altitude(message))
+
+    def _on_attitude(self, message: QuaternionStamped) -> None:
+        self.session.attitudes.add(wire.stamp_ns(message), wire.decode_attitude(message))
+
+    def _on_mask(self, message: Image) -> None:
+        self._submit(self.session.add_mask(wire.decode_mask(message)))
+
+    def _on_map(self, message: PointCloud2) -> None:
+        self._submit(self.session.add_map(wire.decode_map(message)))
+
+    def _on_keyframes(self, message: Path) -> None:
+        self._submit(self.session.add_keyframes(wire.decode_keyframes(message)))
+
+    def _on_database(self, message: String) -> None:
+        if message.data != self.session.database_path:
+            self._worker.submit(self._load, message.data)
+
+    def _load(self, path: str) -> None:
+        if self.session.load(path):
+            self.get_logger().info(f"reference database {path} loaded")
+        else:
+            self.get_logger().error(self.session.reason)
+
+    def _submit(self, job: Job | None) -> None:
+        if job is not None:
+            self._worker.submit(self._solve, job)
+
+    def _solve(self, job: Job) -> None:
+        try:
+            answer = self.session.solve(job)
+        except Exception as error:
+            self.session.reason = f"solving failed: {type(error).__name__}: {error}"
+            self.get_logger().error(self.session.reason)
+            return
+        self._funnel = answer.funnel
+        self._candidates.publish(encode.encode_candidates(answer.candidates, job.local_map.stamp_ns))
+        if isinstance(answer.result, Fix):
+            with self._lock:
+                self._fixed, self._fixes = True, self._fixes + 1
+                self._fix.publish(encode.encode_fix(answer.result))
+                self._pose.publish(encode.encode_pose(answer.result))
+
+    def _on_tick(self) -> None:
+        with self._lock:
+            if not self._fixed:
+                self._fix.publish(encode.encode_fix(self.session.waiting()))
+            fixed, self._fixed = self._fixed, False
+        session = self.session
+        level = DiagnosticStatus.OK if session.matcher is not None else DiagnosticStatus.ERROR
+        self.diagnostics.report(
+            level,
+            "fix" if fixed else f"no fix: {session.waiting().reason}",
+            database=session.database_path,
+            fixes=self._fixes,
+            frames_unusable=session.frames_unusable,
+            maps_skipped=session.maps_skipped,
+            **self._funnel,
+        )
+
+    def destroy_node(self) -> None:
+        self._worker.shutdown(wait=True, cancel_futures=True)
+        super().destroy_node()
+
+
+def main() -> int:
+    """Entry point."""
+    return int(run_node(MatcherNode))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
