@@ -1,0 +1,160 @@
+"""Images paired with the telemetry that belongs to them; one rule for live topics and recorded bags. No ROS."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, insort
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+from buildloc_msgs_py import topics, wire
+from buildloc_msgs_py.errors import BuildlocError
+from buildloc_msgs_py.ground import validate_frame
+from buildloc_msgs_py.types import ByteArray, CameraModel, Frame
+
+T = TypeVar("T")
+Attitude = tuple[float, float, float, float]
+
+MAX_AGE_NS = 1_000_000_000
+HISTORY = 2_000
+
+
+class Series(Generic[T]):
+    """Stamped values of one topic, and the faults of messages that had none; answers with the nearest."""
+
+    def __init__(self, topic: str, max_age_ns: int | None = MAX_AGE_NS) -> None:
+        self.topic = topic
+        self._max_age_ns = max_age_ns
+        self._stamps: list[int] = []
+        self._values: dict[int, T | BuildlocError] = {}
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def add(self, stamp_ns: int, value: T | BuildlocError) -> None:
+        """Keep a value, or the fault of a message whose value cannot be used."""
+        if stamp_ns not in self._values:
+            insort(self._stamps, stamp_ns)
+        self._values[stamp_ns] = value
+        if len(self._stamps) > HISTORY:
+            del self._values[self._stamps.pop(0)]
+
+    def settled(self, stamp_ns: int) -> bool:
+        """Whether no later message of an ordered topic can be nearer to ``stamp_ns``."""
+        if self._max_age_ns is None:
+            return bool(self._stamps)
+        return bool(self._stamps) and self._stamps[-1] >= stamp_ns
+
+    def at(self, stamp_ns: int) -> T:
+        """The value nearest in time; raises WireError when there is none near enough or it was a fault."""
+        if not self._stamps:
+            raise wire.WireError(f"no {self.topic} received; check that it is published or recorded")
+        at = bisect_left(self._stamps, stamp_ns)
+        nearest = min(self._stamps[max(0, at - 1) : at + 1], key=lambda s: abs(s - stamp_ns))
+        if self._max_age_ns is not None and abs(nearest - stamp_ns) > self._max_age_ns:
+            age_s = abs(nearest - stamp_ns) * 1e-9
+            raise wire.WireError(
+                f"{self.topic} nearest to the image is {age_s:.1f} s away; check its rate and its clock"
+            )
+        value = self._values[nearest]
+        if isinstance(value, BuildlocError):
+            raise value
+        return value
+
+
+class Telemetry:
+    """Intrinsics, height above ground and camera attitude, by stamp."""
+
+    def __init__(self) -> None:
+        self.camera: Series[CameraModel] = Series(topics.CAMERA_INFO, max_age_ns=None)
+        self.altitude: Series[float] = Series(topics.ALTITUDE)
+        self.attitude: Series[Attitude] = Series(topics.GIMBAL_ATTITUDE)
+        self._decoders: dict[str, tuple[Series[Any], Callable[[Any], Any]]] = {
+            topics.CAMERA_INFO: (self.camera, wire.decode_camera_info),
+            topics.ALTITUDE: (self.altitude, wire.decode_altitude),
+            topics.GIMBAL_ATTITUDE: (self.attitude, wire.decode_attitude),
+        }
+
+    def add(self, topic: str, message: Any) -> None:
+        """Take a telemetry message of one of the three topics."""
+        series, decode = self._decoders[topic]
+        try:
+            value = decode(message)
+        except BuildlocError as error:
+            value = error
+        series.add(wire.stamp_ns(message), value)
+
+    def settled(self, stamp_ns: int) -> bool:
+        """Whether nothing still to come can change :meth:`at` of this stamp."""
+        return all(series.settled(stamp_ns) for series, _ in self._decoders.values())
+
+    def at(self, stamp_ns: int) -> tuple[CameraModel, float, Attitude]:
+        """Camera, altitude (m) and attitude (x, y, z, w) of an image; WireError says what is missing."""
+        return self.camera.at(stamp_ns), self.altitude.at(stamp_ns), self.attitude.at(stamp_ns)
+
+    def missing(self) -> tuple[str, ...]:
+        """Topics of which nothing was received."""
+        return tuple(topic for topic, (series, _) in self._decoders.items() if len(series) == 0)
+
+
+@dataclass(frozen=True)
+class FrameFault:
+    """An image that cannot be used, and why."""
+
+    stamp_ns: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class _Waiting:
+    stamp_ns: int
+    frame_id: str
+    decode: Callable[[], ByteArray]
+
+
+class FramePairing:
+    """Turns messages in the order they come into frames, in the order of the images.
+
+    An image waits until telemetry at or after its stamp is there, so that live and recorded flights pair
+    the same values; it goes out with what there is when the next image comes or at :meth:`flush`.
+    """
+
+    def __init__(self) -> None:
+        self.telemetry = Telemetry()
+        self._waiting: _Waiting | None = None
+        self._last_stamp_ns = -1
+
+    def add(self, topic: str, message: Any) -> list[Frame | FrameFault]:
+        """Take a message of any input topic; the frames, or faults, that it completes."""
+        done: list[Frame | FrameFault] = []
+        if topic in (topics.IMAGE, topics.IMAGE_COMPRESSED):
+            stamp = wire.stamp_ns(message)
+            if stamp == self._last_stamp_ns:
+                return done  # the same picture, raw and compressed
+            done += self.flush()
+            decode = wire.decode_image if topic == topics.IMAGE else wire.decode_compressed_image
+            self._waiting = _Waiting(stamp, str(message.header.frame_id), lambda: decode(message))
+            self._last_stamp_ns = stamp
+        else:
+            self.telemetry.add(topic, message)
+        if self._waiting is not None and self.telemetry.settled(self._waiting.stamp_ns):
+            done += self.flush()
+        return done
+
+    @property
+    def waiting_stamp_ns(self) -> int | None:
+        """Stamp of the image that waits for its telemetry."""
+        return None if self._waiting is None else self._waiting.stamp_ns
+
+    def flush(self) -> list[Frame | FrameFault]:
+        """The waiting image, if any, with the telemetry there is."""
+        waiting, self._waiting = self._waiting, None
+        if waiting is None:
+            return []
+        try:
+            camera, altitude, attitude = self.telemetry.at(waiting.stamp_ns)
+            frame = Frame(waiting.stamp_ns, waiting.frame_id, waiting.decode(), camera, altitude, attitude)
+            validate_frame(frame)
+        except BuildlocError as error:
+            return [FrameFault(waiting.stamp_ns, str(error))]
+        return [frame]

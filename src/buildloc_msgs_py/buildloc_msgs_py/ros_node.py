@@ -1,0 +1,158 @@
+"""What every node does the same way: parameters from a config, diagnostics, frames in, start and stop."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import QuaternionStamped
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import InvalidParameterException, InvalidParameterValueException
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Range
+
+from buildloc_msgs_py import qos, topics
+from buildloc_msgs_py.config import ConfigError, from_mapping
+from buildloc_msgs_py.errors import BuildlocError
+from buildloc_msgs_py.pairing import FrameFault, FramePairing
+from buildloc_msgs_py.types import Frame
+
+ConfigT = TypeVar("ConfigT")
+DIAGNOSTICS_PERIOD_S = 1.0
+FLUSH_PERIOD_S = 0.5
+
+
+def _descriptor(field: Any) -> ParameterDescriptor:
+    """Documentation and range for parameter tools; dynamic typing lets from_mapping name what is wrong."""
+    low, high = field.metadata.get("low"), field.metadata.get("high")
+    descriptor = ParameterDescriptor(
+        description=field.metadata.get("doc", ""), read_only=True, dynamic_typing=True
+    )
+    if low is not None and high is not None and isinstance(field.default, float):
+        descriptor.floating_point_range = [
+            FloatingPointRange(from_value=float(low), to_value=float(high), step=0.0)
+        ]
+    elif low is not None and high is not None and isinstance(field.default, int):
+        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=1)]
+    return descriptor
+
+
+def declare_config(node: Node, cls: type[ConfigT]) -> ConfigT:
+    """Declare every field of a config dataclass as a read-only ROS parameter and read them.
+
+    Raises ConfigError with one line naming parameter, value and range.
+    """
+    values: dict[str, Any] = {}
+    for field in dataclasses.fields(cls):  # type: ignore[arg-type]
+        default = list(field.default) if isinstance(field.default, tuple) else field.default
+        try:
+            value = node.declare_parameter(field.name, default, _descriptor(field)).value
+        except (InvalidParameterValueException, InvalidParameterException) as error:
+            low, high = field.metadata.get("low"), field.metadata.get("high")
+            value = getattr(error, "value", "?")
+            raise ConfigError(
+                f"parameter {field.name} = {value} is out of range [{low:g}, {high:g}]"
+            ) from error
+        values[field.name] = list(value) if hasattr(value, "typecode") else value
+    return from_mapping(cls, values)
+
+
+class Diagnostics:
+    """The state of one node on /diagnostics: at once when it changes, and every second."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._publisher = node.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, qos.SENSOR)
+        self._status = DiagnosticStatus(level=DiagnosticStatus.OK, message="waiting for input")
+        self._status.name = self._status.hardware_id = node.get_name()
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = node.create_timer(DIAGNOSTICS_PERIOD_S, self._publish, clock=clock)
+
+    def report(self, level: bytes, message: str, **values: object) -> None:
+        """Set level (DiagnosticStatus.OK, WARN, ERROR), message and figures."""
+        changed = (level, message) != (self._status.level, self._status.message)
+        status = DiagnosticStatus(level=level, message=message)
+        status.name = status.hardware_id = self._node.get_name()
+        status.values = [KeyValue(key=key, value=_text(value)) for key, value in values.items()]
+        self._status = status
+        if changed:
+            self._publish()
+
+    def _publish(self) -> None:
+        array = DiagnosticArray(status=[self._status])
+        array.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(array)
+
+
+def _text(value: object) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+class FrameAssembler:
+    """Subscribes to images and telemetry; calls ``on_frame`` with each complete frame.
+
+    What makes an image unusable is reported as a warning, counted in ``faults``, and the node stays up.
+    """
+
+    def __init__(self, node: Node, on_frame: Callable[[Frame], None], diagnostics: Diagnostics) -> None:
+        self.frames = 0
+        self.faults = 0
+        self.pairing = FramePairing()
+        self._on_frame = on_frame
+        self._diagnostics = diagnostics
+        self._settling: int | None = None
+        for kind, topic in (
+            (Image, topics.IMAGE),
+            (CompressedImage, topics.IMAGE_COMPRESSED),
+            (CameraInfo, topics.CAMERA_INFO),
+            (Range, topics.ALTITUDE),
+            (QuaternionStamped, topics.GIMBAL_ATTITUDE),
+        ):
+            node.create_subscription(kind, topic, self._handler(topic), qos.SENSOR)
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = node.create_timer(FLUSH_PERIOD_S, self._on_timer, clock=clock)
+
+    def _handler(self, topic: str) -> Callable[[Any], None]:
+        return lambda message: self._deliver(self.pairing.add(topic, message))
+
+    def _on_timer(self) -> None:
+        """Let an image go that has waited a whole period: its telemetry has stopped."""
+        if self._settling is not None and self._settling == self.pairing.waiting_stamp_ns:
+            self._deliver(self.pairing.flush())
+        self._settling = self.pairing.waiting_stamp_ns
+
+    def _deliver(self, results: list[Frame | FrameFault]) -> None:
+        for result in results:
+            if isinstance(result, FrameFault):
+                self.faults += 1
+                self._diagnostics.report(
+                    DiagnosticStatus.WARN, result.reason, frames=self.frames, frames_unusable=self.faults
+                )
+            else:
+                self.frames += 1
+                self._on_frame(result)
+
+
+def run_node(make: Callable[[], Node]) -> int:
+    """Initialise ROS, spin the node until SIGINT or shutdown; the exit status (2: it refused to start)."""
+    rclpy.init()
+    try:
+        node = make()
+    except BuildlocError as error:
+        print(f"error: {error}", file=sys.stderr)
+        rclpy.try_shutdown()
+        return 2
+    try:
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
