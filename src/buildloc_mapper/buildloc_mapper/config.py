@@ -1,0 +1,35 @@
+"""Every parameter of the mapper, with its unit, default and range."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from buildloc_msgs_py.config import param
+
+
+@dataclass(frozen=True)
+class MapperConfig:
+    """Parameters of frame registration, pose graph, mask fusion and footprint extraction."""
+
+    features: int = param(2000, "SIFT features per keyframe", 50, 20000)
+    feature_width_px: int = param(960, "images wider than this are shrunk before SIFT, px", 100, 10000)
+    match_ratio: float = param(0.8, "nearest to second-nearest descriptor distance (ratio test)", 0.1, 1.0)
+    ransac_threshold_m: float = param(1.0, "inlier distance of the RANSAC similarity, m", 0.01, 100.0)
+    min_inliers: int = param(20, "fewest RANSAC inliers of an accepted pair", 3, 10000)
+    max_scale_deviation: float = param(0.15, "largest deviation of a pair's metric scale from 1", 0.001, 0.9)
+    fallback_keyframes: int = param(3, "earlier keyframes tried when the previous one fails", 0, 100)
+    max_lost: int = param(3, "keyframes in a row without a link before the map starts anew", 1, 1000)
+    loop_radius_m: float = param(40.0, "keyframes nearer than this are tested as loop closures, m", 0.0, 1e4)
+    loop_gap: int = param(6, "fewest keyframes between the two ends of a loop closure", 2, 10000)
+    loop_tests: int = param(2, "loop closures tested per keyframe", 0, 100)
+    sigma_position_m: float = param(0.5, "standard deviation of a link's translation, m", 0.001, 100.0)
+    sigma_rotation_deg: float = param(0.3, "standard deviation of a link's rotation, deg", 0.001, 45.0)
+    sigma_log_scale: float = param(0.01, "standard deviation of a link's log scale", 1e-5, 1.0)
+    sigma_unit_scale: float = param(0.02, "standard deviation of the unit-scale prior", 1e-5, 1.0)
+    loop_weight: float = param(2.0, "weight of a loop closure relative to a consecutive link", 0.01, 100.0)
+    huber_k: float = param(1.345, "residual in standard deviations where the Huber loss turns linear", 0.1, 10.0)
+    map_gsd_m: float = param(0.25, "ground sampling distance of the fused map, m", 0.05, 5.0)
+    min_observations: int = param(2, "fewest keyframes that must see a building pixel", 1, 100)
+    min_share: float = param(0.5, "smallest share of the views of a pixel that call it building", 0.01, 1.0)
+    min_area_m2: float = param(20.0, "smallest building of the map, m2", 0.0, 1e5)
+    simplify_m: float = param(0.5, "tolerance that takes the pixel stairs out of an outline, m", 0.0, 10.0)

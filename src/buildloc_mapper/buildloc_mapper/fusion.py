@@ -1,0 +1,96 @@
+"""Fuses keyframe masks on the ground by counting observations (paper, map stitching)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from buildloc_msgs_py.errors import BuildlocError
+from buildloc_msgs_py.ground import camera_matrix, level_matrix, pixels_to_level
+from buildloc_msgs_py.types import ByteArray, CameraModel, FloatArray
+from numpy.typing import NDArray
+
+from buildloc_mapper.config import MapperConfig
+from buildloc_mapper.registration import Similarity
+
+MAX_CANVAS_PX = 400_000_000
+
+
+@dataclass(frozen=True)
+class View:
+    """The mask of one keyframe, (H, W) uint8, with what puts it on the ground."""
+
+    mask: ByteArray
+    camera: CameraModel
+    altitude_m: float
+    attitude_xyzw: tuple[float, float, float, float]
+
+    def corners_m(self) -> FloatArray:
+        """(4, 2) corners of the image in the level camera frame."""
+        w, h = self.camera.width - 0.5, self.camera.height - 0.5
+        uv = np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h]])
+        return pixels_to_level(uv, self.camera, self.altitude_m, self.attitude_xyzw)
+
+    def level_to_pixels(self) -> FloatArray:
+        """(3, 3) homography from level metres (x, y, 1) to pixels."""
+        to_ray = np.diag([1.0, -1.0, self.altitude_m])
+        level = level_matrix(self.attitude_xyzw)
+        return np.asarray(camera_matrix(self.camera) @ level.T @ to_ray, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class FusedMap:
+    """Counts per pixel, row 0 at the top: keyframes that saw it, and that saw a building there.
+
+    ``left_m`` and ``top_m`` are the outer corner of pixel (0, 0) in ``buildloc_map``.
+    """
+
+    left_m: float
+    top_m: float
+    gsd_m: float
+    seen: NDArray[np.uint16]
+    building: NDArray[np.uint16]
+
+    def confirmed(self, config: MapperConfig) -> ByteArray:
+        """0 or 255: building in enough keyframes and in a large enough share of its views."""
+        enough = self.building >= config.min_observations
+        share = self.building >= config.min_share * self.seen
+        return (enough & share).astype(np.uint8) * np.uint8(255)
+
+
+def _map_to_level(pose: Similarity) -> FloatArray:
+    c, s = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
+    forward = np.array(
+        [[pose.scale * c, -pose.scale * s, pose.x_m], [pose.scale * s, pose.scale * c, pose.y_m], [0, 0, 1.0]]
+    )
+    return np.asarray(np.linalg.inv(forward), dtype=np.float64)
+
+
+def fuse(views: Sequence[View], poses: Sequence[Similarity], config: MapperConfig) -> FusedMap:
+    """Warp every mask to the map and count. Raises BuildlocError when the map is impossibly large."""
+    gsd = config.map_gsd_m
+    corners = [pose.apply(view.corners_m()) for view, pose in zip(views, poses, strict=True)]
+    low, high = np.vstack(corners).min(axis=0), np.vstack(corners).max(axis=0)
+    left, top = float(low[0]), float(high[1])
+    width, height = (int(v) + 1 for v in np.ceil((high - low) / gsd))
+    if width * height > MAX_CANVAS_PX:
+        raise BuildlocError(
+            f"the map would be {width}x{height} pixels; raise map_gsd_m or check the altitude telemetry"
+        )
+    seen = np.zeros((height, width), dtype=np.uint16)
+    building = np.zeros_like(seen)
+    for view, pose, quad in zip(views, poses, corners, strict=True):
+        c0, r0 = np.floor([(quad[:, 0].min() - left) / gsd, (top - quad[:, 1].max()) / gsd]).astype(int)
+        c1, r1 = np.ceil([(quad[:, 0].max() - left) / gsd, (top - quad[:, 1].min()) / gsd]).astype(int)
+        pixel_to_map = np.array([[gsd, 0.0, left + (c0 + 0.5) * gsd], [0.0, -gsd, top - (r0 + 0.5) * gsd], [0, 0, 1.0]])
+        homography = view.level_to_pixels() @ _map_to_level(pose) @ pixel_to_map
+        size = (int(c1 - c0), int(r1 - r0))
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        window = np.s_[r0:r1, c0:c1]
+        whole = np.full_like(view.mask, 255)
+        seen[window] += np.asarray(cv2.warpPerspective(whole, homography, size, flags=flags)) > 254
+        building[window] += np.asarray(cv2.warpPerspective(view.mask, homography, size, flags=flags)) > 127
+    return FusedMap(left, top, gsd, seen, building)

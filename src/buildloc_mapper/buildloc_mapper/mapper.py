@@ -1,0 +1,135 @@
+"""Keyframes in, map out: register, optimise, fuse, extract."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from dataclasses import dataclass
+
+from buildloc_msgs_py.config import check
+from buildloc_msgs_py.errors import BuildlocError
+from buildloc_msgs_py.ground import validate_frame
+from buildloc_msgs_py.types import Frame, Keyframe, LocalMap, Mask
+
+from buildloc_mapper.config import MapperConfig
+from buildloc_mapper.extraction import LocalOutlines, extract_buildings
+from buildloc_mapper.fusion import View, fuse
+from buildloc_mapper.pose_graph import Edge, optimize
+from buildloc_mapper.registration import Features, Link, Similarity, extract, register
+
+ORIGIN = Similarity(0.0, 0.0, 0.0, 1.0)
+
+
+class MapperError(BuildlocError):
+    """A keyframe cannot be added."""
+
+
+@dataclass(frozen=True)
+class MapUpdate:
+    """The optimised keyframes, the buildings of the map with their outlines, and the funnel."""
+
+    keyframes: tuple[Keyframe, ...]
+    local_map: LocalMap
+    outlines: LocalOutlines
+    funnel: dict[str, float]
+
+
+@dataclass(frozen=True)
+class _Node:
+    stamp_ns: int
+    features: Features
+    view: View
+
+
+class Mapper:
+    """One growing map. ``buildloc_map`` has its origin and heading from the map's first keyframe."""
+
+    def __init__(self, config: MapperConfig) -> None:
+        check(config)
+        self.config = config
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the flight."""
+        self._rejected: Counter[str] = Counter()
+        self._restarts = 0
+        self._start_anew()
+
+    def _start_anew(self) -> None:
+        self._nodes: list[_Node] = []
+        self._poses: list[Similarity] = []
+        self._edges: list[Edge] = []
+        self._lost = 0
+
+    def add(self, frame: Frame, mask: Mask) -> MapUpdate | None:
+        """Add a keyframe and its mask; the new map, or None when the keyframe links to nothing.
+
+        After ``max_lost`` such keyframes in a row the map starts anew from the latest. Raises
+        MapperError when frame and mask do not belong together, WireError for unusable telemetry.
+        """
+        validate_frame(frame)
+        if mask.stamp_ns != frame.stamp_ns or mask.pixels.shape != frame.image_bgr.shape[:2]:
+            raise MapperError("mask and image differ in stamp or size; feed the segmenter's own masks")
+        started = time.perf_counter()
+        view = View(mask.pixels, frame.camera, frame.altitude_m, frame.attitude_xyzw)
+        node = _Node(frame.stamp_ns, extract(frame, self.config), view)
+        if not self._attach(node):
+            return None
+        self._close_loops()
+        self._poses = optimize(self._poses, self._edges, self.config)
+        fused = fuse([n.view for n in self._nodes], self._poses, self.config)
+        found = extract_buildings(fused, frame.stamp_ns, self.config)
+        keyframes = tuple(
+            Keyframe(n.stamp_ns, p.x_m, p.y_m, p.yaw_rad, p.scale)
+            for n, p in zip(self._nodes, self._poses, strict=True)
+        )
+        funnel: dict[str, float] = {
+            "keyframes": len(self._nodes),
+            "loop_closures": sum(e.loop for e in self._edges),
+            "restarts": self._restarts,
+            "buildings": len(found.local_map),
+            "truncated": found.truncated,
+            "unusable": found.unusable,
+            **{f"rejected_{reason}": count for reason, count in sorted(self._rejected.items())},
+            "seconds": time.perf_counter() - started,
+        }
+        return MapUpdate(keyframes, found.local_map, found.outlines, funnel)
+
+    def _link(self, earlier: int, node: _Node, loop: bool = False) -> bool:
+        link = register(self._nodes[earlier].features, node.features, self.config)
+        if not isinstance(link, Link):
+            self._rejected[("loop_" if loop else "") + link.reason] += 1
+            return False
+        later = len(self._nodes) - 1 if loop else len(self._nodes)
+        self._edges.append(Edge(earlier, later, link.transform, link.inliers, loop))
+        return True
+
+    def _attach(self, node: _Node) -> bool:
+        """Link a keyframe to the latest one it registers with; the first one starts the map."""
+        latest = len(self._nodes) - 1
+        for earlier in range(latest, max(-1, latest - 1 - self.config.fallback_keyframes), -1):
+            if self._link(earlier, node):
+                self._poses.append(self._poses[earlier].compose(self._edges[-1].transform))
+                self._nodes.append(node)
+                self._lost = 0
+                return True
+        self._lost += 1
+        if self._nodes and self._lost < self.config.max_lost:
+            return False
+        self._restarts += bool(self._nodes)
+        self._start_anew()
+        self._nodes, self._poses = [node], [ORIGIN]
+        return True
+
+    def _close_loops(self) -> None:
+        """Test the spatially nearest keyframes of long ago against the newest one."""
+        newest = len(self._nodes) - 1
+        here = self._poses[newest]
+        distances = sorted(
+            (math.hypot(p.x_m - here.x_m, p.y_m - here.y_m), i)
+            for i, p in enumerate(self._poses[: max(0, newest - self.config.loop_gap + 1)])
+        )
+        near = [i for distance, i in distances if distance <= self.config.loop_radius_m]
+        for earlier in near[: self.config.loop_tests]:
+            self._link(earlier, self._nodes[newest], loop=True)

@@ -1,0 +1,92 @@
+"""Images with telemetry and /buildloc/mask in; /buildloc/map and /buildloc/keyframes out."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from buildloc_msgs_py import encode, qos, topics, wire
+from buildloc_msgs_py.errors import BuildlocError
+from buildloc_msgs_py.ros_node import Diagnostics, FrameAssembler, declare_config, run_node
+from buildloc_msgs_py.types import Frame, Mask
+from diagnostic_msgs.msg import DiagnosticStatus
+from nav_msgs.msg import Path
+from rclpy.node import Node
+from sensor_msgs.msg import Image, PointCloud2
+from std_srvs.srv import Trigger
+
+from buildloc_mapper.config import MapperConfig
+from buildloc_mapper.mapper import Mapper
+
+FRAMES_KEPT = 20
+
+
+class MapperNode(Node):  # type: ignore[misc]
+    """Adds every masked keyframe to the map and publishes both."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("mapper_node", **kwargs)
+        self._mapper = Mapper(declare_config(self, MapperConfig))
+        self._diagnostics = Diagnostics(self)
+        self._frames: dict[int, Frame] = {}
+        self._masks: dict[int, Mask] = {}
+        self._dropped = 0
+        self._map = self.create_publisher(PointCloud2, topics.MAP, qos.SENSOR)
+        self._keyframes = self.create_publisher(Path, topics.KEYFRAMES, qos.SENSOR)
+        self._assembler = FrameAssembler(self, self._on_frame, self._diagnostics)
+        self.create_subscription(Image, topics.MASK, self._on_mask, qos.SENSOR)
+        self.create_service(Trigger, topics.RESET, self._on_reset)
+
+    def _on_frame(self, frame: Frame) -> None:
+        self._frames[frame.stamp_ns] = frame
+        self._add(frame.stamp_ns)
+
+    def _on_mask(self, message: Image) -> None:
+        try:
+            mask = wire.decode_mask(message)
+        except wire.WireError as error:
+            self._diagnostics.report(DiagnosticStatus.WARN, str(error))
+            return
+        self._masks[mask.stamp_ns] = mask
+        self._add(mask.stamp_ns)
+
+    def _add(self, stamp_ns: int) -> None:
+        """Add a keyframe once its image and its mask are both here."""
+        if stamp_ns in self._frames and stamp_ns in self._masks:
+            self._update(self._frames.pop(stamp_ns), self._masks.pop(stamp_ns))
+        while len(self._frames) > FRAMES_KEPT:
+            self._frames.pop(next(iter(self._frames)))
+        while len(self._masks) > FRAMES_KEPT:
+            self._masks.pop(next(iter(self._masks)))
+            self._dropped += 1
+
+    def _update(self, frame: Frame, mask: Mask) -> None:
+        try:
+            update = self._mapper.add(frame, mask)
+        except BuildlocError as error:
+            self._diagnostics.report(DiagnosticStatus.WARN, str(error))
+            return
+        if update is None:
+            self._diagnostics.report(DiagnosticStatus.WARN, "keyframe links to none of the latest keyframes")
+            return
+        self._map.publish(encode.encode_map(update.local_map))
+        self._keyframes.publish(encode.encode_keyframes(update.keyframes))
+        figures = {**update.funnel, "masks_without_image": self._dropped}
+        self._diagnostics.report(DiagnosticStatus.OK, "mapping", **figures)
+
+    def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._mapper.reset()
+        self._frames.clear()
+        self._masks.clear()
+        self._diagnostics.report(DiagnosticStatus.OK, "flight forgotten")
+        response.success, response.message = True, "flight forgotten; the reference is kept"
+        return response
+
+
+def main() -> int:
+    """Entry point."""
+    return int(run_node(MapperNode))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
