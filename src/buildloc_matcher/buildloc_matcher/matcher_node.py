@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
-from buildloc_msgs_py import encode, ground, qos, topics, wire
+from buildloc_msgs_py import encode, qos, topics, wire
 from buildloc_msgs_py.ros_node import Diagnostics, declare_config, run_node
 from buildloc_msgs_py.types import Fix
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -36,7 +36,7 @@ class MatcherNode(Node):  # type: ignore[misc]
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("matcher_node", **kwargs)
-        self.session = Session(declare_config(self, MatcherConfig), ground.observe)
+        self.session = Session(declare_config(self, MatcherConfig))
         self.diagnostics = Diagnostics(self)
         self._lock = threading.Lock()
         self._worker = ThreadPoolExecutor(1, "solve")
@@ -46,16 +46,17 @@ class MatcherNode(Node):  # type: ignore[misc]
         self._candidates = self.create_publisher(PointCloud2, topics.CANDIDATES, qos.SENSOR)
         self._fix = self.create_publisher(NavSatFix, topics.FIX, qos.SENSOR)
         self._pose = self.create_publisher(PoseWithCovarianceStamped, topics.POSE, qos.SENSOR)
+        telemetry = self.session.telemetry.add
         for kind, topic, profile, handle in (
-            (CameraInfo, topics.CAMERA_INFO, qos.SENSOR, self._on_camera_info),
-            (Range, topics.ALTITUDE, qos.SENSOR, self._on_altitude),
-            (QuaternionStamped, topics.GIMBAL_ATTITUDE, qos.SENSOR, self._on_attitude),
-            (Image, topics.MASK, qos.SENSOR, self._on_mask),
-            (PointCloud2, topics.MAP, qos.SENSOR, self._on_map),
-            (Path, topics.KEYFRAMES, qos.SENSOR, self._on_keyframes),
+            (CameraInfo, topics.CAMERA_INFO, qos.SENSOR, partial(telemetry, topics.CAMERA_INFO)),
+            (Range, topics.ALTITUDE, qos.SENSOR, partial(telemetry, topics.ALTITUDE)),
+            (QuaternionStamped, topics.GIMBAL_ATTITUDE, qos.SENSOR, partial(telemetry, topics.GIMBAL_ATTITUDE)),
+            (Image, topics.MASK, qos.SENSOR, partial(self._guarded, self._on_mask)),
+            (PointCloud2, topics.MAP, qos.SENSOR, partial(self._guarded, self._on_map)),
+            (Path, topics.KEYFRAMES, qos.SENSOR, partial(self._guarded, self._on_keyframes)),
             (String, topics.REFERENCE_DATABASE, qos.LATCHED, self._on_database),
         ):
-            self.create_subscription(kind, topic, partial(self._guarded, handle), profile)
+            self.create_subscription(kind, topic, handle, profile)
         database = str(self.declare_parameter("database", "").value)
         if database:
             self._worker.submit(self._load, database)
@@ -66,15 +67,6 @@ class MatcherNode(Node):  # type: ignore[misc]
             handle(message)
         except wire.WireError as error:
             self.diagnostics.report(DiagnosticStatus.WARN, str(error))
-
-    def _on_camera_info(self, message: CameraInfo) -> None:
-        self.session.camera = wire.decode_camera_info(message)
-
-    def _on_altitude(self, message: Range) -> None:
-        self.session.altitudes.add(wire.stamp_ns(message), wire.decode_altitude(message))
-
-    def _on_attitude(self, message: QuaternionStamped) -> None:
-        self.session.attitudes.add(wire.stamp_ns(message), wire.decode_attitude(message))
 
     def _on_mask(self, message: Image) -> None:
         self._submit(self.session.add_mask(wire.decode_mask(message)))

@@ -3,42 +3,20 @@ keyframes, and hands out complete jobs. Stamps in ns."""
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 from buildloc_msgs_py.errors import BuildlocError
-from buildloc_msgs_py.types import ByteArray, CameraModel, FrameObservation, Keyframe, LocalMap, Mask, NoFix
+from buildloc_msgs_py.ground import observe
+from buildloc_msgs_py.pairing import Telemetry
+from buildloc_msgs_py.types import FrameObservation, Keyframe, LocalMap, Mask, NoFix
 
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.database import open_database
 from buildloc_matcher.matcher import Answer, Matcher
 
-T = TypeVar("T")
-Attitude = tuple[float, float, float, float]
-Observe = Callable[[ByteArray, int, CameraModel, float, Attitude, float], FrameObservation]
-
-SLOP_NS = 50_000_000
-MAX_AGE_NS = 2_000_000_000
-HISTORY = 20_000
 PENDING = 10
-
-
-class Series(Generic[T]):
-    """Stamped values; answers with the latest one no later than a stamp and not too old for it."""
-
-    def __init__(self) -> None:
-        self._values: deque[tuple[int, T]] = deque(maxlen=HISTORY)
-
-    def add(self, stamp_ns: int, value: T) -> None:
-        self._values.append((stamp_ns, value))
-
-    def at(self, stamp_ns: int) -> T | None:
-        """The value for a stamp, or None: nothing within MAX_AGE_NS before it (SLOP_NS after)."""
-        usable = [v for v in self._values if stamp_ns - MAX_AGE_NS <= v[0] <= stamp_ns + SLOP_NS]
-        return max(usable, key=lambda v: v[0])[1] if usable else None
 
 
 @dataclass(frozen=True)
@@ -53,11 +31,9 @@ class Job:
 class Session:
     """The state of one matcher: its reference, the telemetry, the frames seen and why there is no fix."""
 
-    def __init__(self, config: MatcherConfig, observe: Observe) -> None:
+    def __init__(self, config: MatcherConfig) -> None:
         self.config = config
-        self.altitudes: Series[float] = Series()
-        self.attitudes: Series[Attitude] = Series()
-        self.camera: CameraModel | None = None
+        self.telemetry = Telemetry()
         self.matcher: Matcher | None = None
         self.database_path = ""
         self.reason = "no reference database: set the parameter `database` or call /buildloc/reference/load"
@@ -65,7 +41,6 @@ class Session:
         self.telemetry_fault = ""
         self.frames_unusable = 0
         self.maps_skipped = 0
-        self._observe = observe
         self._frames: dict[int, FrameObservation | None] = {}
         self._maps: dict[int, LocalMap] = {}
         self._keyframes: dict[int, tuple[Keyframe, ...]] = {}
@@ -84,21 +59,18 @@ class Session:
     def add_mask(self, mask: Mask) -> Job | None:
         """What a keyframe saw; a mask without its telemetry counts as seen, with nothing in it."""
         self.latest_stamp_ns = mask.stamp_ns
-        altitude, attitude = self.altitudes.at(mask.stamp_ns), self.attitudes.at(mask.stamp_ns)
-        camera = self.camera
         seen: FrameObservation | None = None
         self.telemetry_fault = ""
-        if camera is None or altitude is None or attitude is None:
-            named = (("camera info", camera), ("altitude", altitude), ("gimbal attitude", attitude))
-            missing = ", ".join(name for name, value in named if value is None)
-            self.telemetry_fault = f"no {missing} for the image; check that it is published and its stamps"
-        elif mask.pixels.shape != (camera.height, camera.width):
-            size = f"{mask.pixels.shape[1]}x{mask.pixels.shape[0]}"
-            self.telemetry_fault = f"mask is {size}, camera_info says {camera.width}x{camera.height}"
-        else:
-            seen = self._observe(
+        try:
+            camera, altitude, attitude = self.telemetry.at(mask.stamp_ns)
+            if mask.pixels.shape != (camera.height, camera.width):
+                size = f"{mask.pixels.shape[1]}x{mask.pixels.shape[0]}"
+                raise BuildlocError(f"mask is {size}, camera_info says {camera.width}x{camera.height}")
+            seen = observe(
                 mask.pixels, mask.stamp_ns, camera, altitude, attitude, self.config.min_area_m2
             )
+        except BuildlocError as error:
+            self.telemetry_fault = str(error)
         self.frames_unusable += seen is None
         self._frames[mask.stamp_ns] = seen
         while len(self._frames) > 4 * self.config.refine_frames:
@@ -139,5 +111,11 @@ class Session:
 
     def waiting(self) -> NoFix:
         """No position right now, at the capture time of the latest image."""
-        fault = self.telemetry_fault if self.matcher is not None else ""
-        return NoFix(self.latest_stamp_ns, fault or self.reason)
+        missing = self.telemetry.missing()
+        if self.matcher is None:
+            reason = self.reason
+        elif missing:
+            reason = f"no {', '.join(missing)} received; check that it is published"
+        else:
+            reason = self.telemetry_fault or self.reason
+        return NoFix(self.latest_stamp_ns, reason)

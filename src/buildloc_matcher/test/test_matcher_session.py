@@ -7,17 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from buildloc_matcher.config import MatcherConfig
-from buildloc_matcher.session import PENDING, Series, Session
-from buildloc_msgs_py.types import CameraModel, FrameObservation, Keyframe, LocalMap, Mask, NoFix
+from buildloc_matcher.session import PENDING, Session
+from buildloc_msgs_py.types import CameraModel, Keyframe, LocalMap, Mask, NoFix
 
 CAMERA = CameraModel(8, 6, 10.0, 10.0, 4.0, 3.0)
 SECOND = 10**9
-
-
-def seen(
-    pixels: np.ndarray, stamp_ns: int, camera: CameraModel, altitude_m: float, *_: object
-) -> FrameObservation:
-    return FrameObservation(stamp_ns, np.zeros((1, 2)), altitude_m)
 
 
 def mask(stamp_ns: int, width: int = 8) -> Mask:
@@ -30,21 +24,12 @@ def empty_map(stamp_ns: int) -> LocalMap:
 
 
 def with_telemetry() -> Session:
-    session = Session(MatcherConfig(), seen)
-    session.camera = CAMERA
+    session = Session(MatcherConfig())
+    session.telemetry.camera.add(0, CAMERA)
     for second in range(100):
-        session.altitudes.add(second * SECOND, 100.0 + second)
-        session.attitudes.add(second * SECOND, (0.0, 0.0, 0.0, 1.0))
+        session.telemetry.altitude.add(second * SECOND, 100.0 + second)
+        session.telemetry.attitude.add(second * SECOND, (0.0, 0.0, 0.0, 1.0))
     return session
-
-
-def test_series_answers_with_the_latest_value_that_is_not_too_old() -> None:
-    series: Series[float] = Series()
-    assert series.at(0) is None
-    series.add(1 * SECOND, 1.0)
-    series.add(2 * SECOND, 2.0)
-    assert series.at(2 * SECOND - 10**8) == 1.0 and series.at(2 * SECOND - 10**7) == 2.0
-    assert series.at(4 * SECOND) == 2.0 and series.at(4 * SECOND + 1) is None and series.at(0) is None
 
 
 @pytest.mark.parametrize("order", ["mask map keys", "keys map mask", "map mask keys"])
@@ -66,17 +51,14 @@ def test_a_job_is_complete_once_in_any_order(order: str) -> None:
 
 
 def test_missing_telemetry_and_another_size_are_said_and_do_not_block() -> None:
-    session = Session(MatcherConfig(), seen)
-    session.camera = CAMERA
-    session.altitudes.add(SECOND, 100.0)
+    session = Session(MatcherConfig())
+    session.telemetry.camera.add(0, CAMERA)
+    session.telemetry.altitude.add(SECOND, 100.0)
     session.load(str(Path("nowhere") / "absent.arrow"))
     session.add_mask(mask(SECOND))
-    assert (
-        session.telemetry_fault
-        == "no gimbal attitude for the image; check that it is published and its stamps"
-    )
+    assert session.telemetry_fault == "no gimbal/attitude received; check that it is published or recorded"
     assert "absent.arrow" in session.waiting().reason and session.waiting().stamp_ns == SECOND
-    session.attitudes.add(SECOND, (0.0, 0.0, 0.0, 1.0))
+    session.telemetry.attitude.add(SECOND, (0.0, 0.0, 0.0, 1.0))
     session.add_mask(mask(SECOND, 9))
     assert session.telemetry_fault == "mask is 9x6, camera_info says 8x6" and session.frames_unusable == 2
     session.add_map(empty_map(SECOND))
