@@ -1,0 +1,1 @@
+"""GNSS-free position from building patterns: command line, offline localizer, replay, launch."""

@@ -1,0 +1,1 @@
+"""Buildings in an image: keyframe policy, ONNX inference, mask clean-up."""
