@@ -30,7 +30,7 @@ class MapperNode(Node):  # type: ignore[misc]
         self._diagnostics = Diagnostics(self)
         self._frames: dict[int, Frame] = {}
         self._masks: dict[int, Mask] = {}
-        self._dropped = 0
+        self._received = self._published = self._dropped = 0
         self._map = self.create_publisher(PointCloud2, topics.MAP, qos.SENSOR)
         self._keyframes = self.create_publisher(Path, topics.KEYFRAMES, qos.SENSOR)
         self._assembler = FrameAssembler(self, self._on_frame, self._diagnostics)
@@ -45,7 +45,7 @@ class MapperNode(Node):  # type: ignore[misc]
         try:
             mask = wire.decode_mask(message)
         except wire.WireError as error:
-            self._diagnostics.report(DiagnosticStatus.WARN, str(error))
+            self._report(DiagnosticStatus.WARN, str(error))
             return
         self._masks[mask.stamp_ns] = mask
         self._add(mask.stamp_ns)
@@ -61,24 +61,29 @@ class MapperNode(Node):  # type: ignore[misc]
             self._dropped += 1
 
     def _update(self, frame: Frame, mask: Mask) -> None:
+        self._received += 1
         try:
             update = self._mapper.add(frame, mask)
         except BuildlocError as error:
-            self._diagnostics.report(DiagnosticStatus.WARN, str(error))
+            self._report(DiagnosticStatus.WARN, str(error))
             return
         if update is None:
-            self._diagnostics.report(DiagnosticStatus.WARN, "keyframe links to none of the latest keyframes")
+            self._report(DiagnosticStatus.WARN, "keyframe links to none of the latest keyframes")
             return
-        self._map.publish(encode.encode_map(update.local_map))
         self._keyframes.publish(encode.encode_keyframes(update.keyframes))
-        figures = {**update.funnel, "masks_without_image": self._dropped}
-        self._diagnostics.report(DiagnosticStatus.OK, "mapping", **figures)
+        self._map.publish(encode.encode_map(update.local_map))
+        self._published += 1
+        self._report(DiagnosticStatus.OK, "mapping", **update.funnel)
+
+    def _report(self, level: bytes, message: str, **figures: float) -> None:
+        counts = {"masks": self._received, "maps": self._published, "masks_without_image": self._dropped}
+        self._diagnostics.report(level, message, **counts, **figures)
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._mapper.reset()
         self._frames.clear()
         self._masks.clear()
-        self._diagnostics.report(DiagnosticStatus.OK, "flight forgotten")
+        self._report(DiagnosticStatus.OK, "flight forgotten")
         response.success, response.message = True, "flight forgotten; the reference is kept"
         return response
 

@@ -81,7 +81,7 @@ class Matcher:
         scores.sort(key=lambda pair: (-pair[1].jaccard, -pair[0].votes))
         ranked = [self._candidate(score, cluster.votes, centre) for cluster, score in scores]
         if ranked:
-            ratio = lead(ranked[0], ranked[1:], config)
+            ratio = funnel["lead"] = lead(ranked[0], ranked[1:], config)
             first = acceptance_score(ranked[0].mnn_jaccard, ratio, config)
             ranked[0] = replace(ranked[0], acceptance=first)
         funnel |= {
@@ -112,6 +112,15 @@ class Matcher:
             min(1.0, score.jaccard / self.config.min_jaccard) if self.config.min_jaccard > 0.0 else 1.0,
         )
 
+    def refuse(self, found: MatchResult) -> str | None:
+        """Why the best candidate of a map is not convincing, or None."""
+        buildings = found.funnel["buildings"]
+        if buildings < self.config.min_buildings:
+            return f"map has {buildings:.0f} buildings, fewer than {self.config.min_buildings}"
+        if not found.candidates:
+            return "no candidate: no place in the reference gathers enough consistent votes"
+        return refuse_coarse(found.scores[0], found.funnel["lead"], self.config)
+
     def fix(
         self, local_map: LocalMap, keyframes: Sequence[Keyframe], observations: Sequence[FrameObservation]
     ) -> Answer:
@@ -122,17 +131,9 @@ class Matcher:
         def none(reason: str) -> Answer:
             return Answer(NoFix(local_map.stamp_ns, reason), found.candidates, funnel)
 
-        if funnel["buildings"] < self.config.min_buildings:
-            return none(
-                f"map has {funnel['buildings']:.0f} buildings, fewer than {self.config.min_buildings}"
-            )
         if not keyframes:
             return none("no keyframes yet")
-        if not found.candidates:
-            return none("no candidate: no place in the reference gathers enough consistent votes")
-        ratio = lead(found.candidates[0], found.candidates[1:], self.config)
-        funnel["lead"] = ratio
-        refused = refuse_coarse(found.scores[0], ratio, self.config)
+        refused = self.refuse(found)
         if refused is not None:
             return none(refused)
         refined = refine(

@@ -41,7 +41,8 @@ class MatcherNode(Node):  # type: ignore[misc]
         self._lock = threading.Lock()
         self._worker = ThreadPoolExecutor(1, "solve")
         self._fixed = False
-        self._fixes = 0
+        self._next: Job | None = None
+        self._answered = self._fixes = 0
         self._funnel: dict[str, float] = {}
         self._candidates = self.create_publisher(PointCloud2, topics.CANDIDATES, qos.SENSOR)
         self._fix = self.create_publisher(NavSatFix, topics.FIX, qos.SENSOR)
@@ -88,8 +89,21 @@ class MatcherNode(Node):  # type: ignore[misc]
             self.get_logger().error(self.session.reason)
 
     def _submit(self, job: Job | None) -> None:
+        """Solve the job next; one that still waits is overtaken, so that answers never lag behind."""
+        if job is None:
+            return
+        with self._lock:
+            overtaken, self._next = self._next, job
+            self.session.maps_skipped += overtaken is not None
+        if overtaken is None:
+            self._worker.submit(self._solve_next)
+
+    def _solve_next(self) -> None:
+        with self._lock:
+            job, self._next = self._next, None
         if job is not None:
-            self._worker.submit(self._solve, job)
+            self._solve(job)
+            self._answered += 1
 
     def _solve(self, job: Job) -> None:
         try:
@@ -117,6 +131,7 @@ class MatcherNode(Node):  # type: ignore[misc]
             level,
             "fix" if fixed else f"no fix: {session.waiting().reason}",
             database=session.database_path,
+            maps_answered=self._answered,
             fixes=self._fixes,
             frames_unusable=session.frames_unusable,
             maps_skipped=session.maps_skipped,

@@ -68,6 +68,7 @@ class Diagnostics:
 
     def __init__(self, node: Node) -> None:
         self._node = node
+        self._values: dict[str, object] = {}
         self._publisher = node.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, qos.SENSOR)
         self._status = DiagnosticStatus(level=DiagnosticStatus.OK, message="waiting for input")
         self._status.name = self._status.hardware_id = node.get_name()
@@ -75,11 +76,12 @@ class Diagnostics:
         self._timer = node.create_timer(DIAGNOSTICS_PERIOD_S, self._publish, clock=clock)
 
     def report(self, level: bytes, message: str, **values: object) -> None:
-        """Set level (DiagnosticStatus.OK, WARN, ERROR), message and figures."""
+        """Set level (DiagnosticStatus.OK, WARN, ERROR) and message; figures stay until they are set again."""
         changed = (level, message) != (self._status.level, self._status.message)
+        self._values.update(values)
         status = DiagnosticStatus(level=level, message=message)
         status.name = status.hardware_id = self._node.get_name()
-        status.values = [KeyValue(key=key, value=_text(value)) for key, value in values.items()]
+        status.values = [KeyValue(key=key, value=_text(value)) for key, value in self._values.items()]
         self._status = status
         if changed:
             self._publish()
