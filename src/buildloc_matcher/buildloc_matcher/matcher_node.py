@@ -58,9 +58,6 @@ class MatcherNode(Node):  # type: ignore[misc]
             (String, topics.REFERENCE_DATABASE, qos.LATCHED, self._on_database),
         ):
             self.create_subscription(kind, topic, handle, profile)
-        database = str(self.declare_parameter("database", "").value)
-        if database:
-            self._worker.submit(self._load, database)
         self.create_timer(NO_FIX_PERIOD_S, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _guarded(self, handle: Callable[[Any], None], message: Any) -> None:

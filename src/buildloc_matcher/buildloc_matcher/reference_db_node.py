@@ -33,10 +33,12 @@ class ReferenceDbNode(Node):  # type: ignore[misc]
         self.diagnostics = Diagnostics(self)
         self._publisher = self.create_publisher(String, topics.REFERENCE_DATABASE, qos.LATCHED)
         self.create_service(LoadMap, topics.REFERENCE_LOAD, self._on_load)
-        self.diagnostics.report(DiagnosticStatus.WARN, "no reference database: call /buildloc/reference/load")
         database = str(self.declare_parameter("database", "").value)
         if database:
             self.load(database)
+        else:
+            hint = "no reference database: call /buildloc/reference/load"
+            self.diagnostics.report(DiagnosticStatus.WARN, hint)
 
     def load(self, map_url: str) -> int:
         """Open, check and announce a database; the result code of nav_msgs/srv/LoadMap."""

@@ -19,6 +19,11 @@ from buildloc_matcher.matcher import Answer, Matcher
 PENDING = 10
 
 
+def frames_kept(config: MatcherConfig) -> int:
+    """Observations worth keeping: some of the latest frames may have found no place in the map."""
+    return 4 * config.refine_frames
+
+
 @dataclass(frozen=True)
 class Job:
     """One solve: a map with the keyframes it was made from and what the frames saw."""
@@ -36,7 +41,7 @@ class Session:
         self.telemetry = Telemetry()
         self.matcher: Matcher | None = None
         self.database_path = ""
-        self.reason = "no reference database: set the parameter `database` or call /buildloc/reference/load"
+        self.reason = "no reference database: call /buildloc/reference/load"
         self.latest_stamp_ns = 0
         self.telemetry_fault = ""
         self.frames_unusable = 0
@@ -73,7 +78,7 @@ class Session:
             self.telemetry_fault = str(error)
         self.frames_unusable += seen is None
         self._frames[mask.stamp_ns] = seen
-        while len(self._frames) > 4 * self.config.refine_frames:
+        while len(self._frames) > frames_kept(self.config):
             del self._frames[next(iter(self._frames))]
         return self._complete(mask.stamp_ns)
 

@@ -1,0 +1,382 @@
+"""The command line: every stage alone, offline, through files."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import json
+import math
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from buildloc_msgs_py.errors import BuildlocError
+
+Run = Callable[[argparse.Namespace], int]
+EXTENSIONS = "buildloc.commands"
+
+
+def _location(text: str) -> tuple[float, float]:
+    try:
+        latitude, longitude = (float(v) for v in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not LATITUDE,LONGITUDE") from None
+    if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not LATITUDE,LONGITUDE in degrees")
+    return latitude, longitude
+
+
+def _settings_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--config", type=Path, help="YAML of ROS parameters (default: the installed buildloc.yaml)")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="NODE.PARAMETER=VALUE", dest="overrides",
+        help="override one parameter, e.g. segmenter_node.model=net.onnx; repeatable",
+    )  # fmt: skip
+
+
+def _progress(text: str) -> None:
+    if sys.stderr.isatty():
+        print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
+
+
+def _progress_end() -> None:
+    _progress("")
+
+
+def _refdb_build(args: argparse.Namespace) -> int:
+    from buildloc_matcher.config import MatcherConfig
+    from buildloc_matcher.database import assemble, save
+    from buildloc_matcher.ingest import ingest
+
+    from buildloc.settings import REFERENCE_DB, config_of, load
+
+    config = config_of(load(args.config, args.overrides), REFERENCE_DB, MatcherConfig)
+    _progress("reading footprints")
+    found = ingest(args.sources, config.min_area_m2, args.center, args.radius_km)
+    _progress(f"describing {len(found.areas_m2)} buildings")
+    database = assemble(found.epsg, found.centroids_m, found.areas_m2, found.shapes, config)
+    save(database, args.out)
+    _progress_end()
+    for name, count in found.counts.items():
+        print(f"{name:>14}  {count}")
+    print(f"{args.out}: {len(database)} buildings, {len(database.stars)} stars, EPSG:{database.epsg}")
+    return 0
+
+
+def _refdb_info(args: argparse.Namespace) -> int:
+    from buildloc_matcher.config import MatcherConfig
+    from buildloc_matcher.database import open_database
+
+    from buildloc.settings import REFERENCE_DB, config_of, load
+
+    database = open_database(args.database, config_of(load(args.config, args.overrides), REFERENCE_DB, MatcherConfig))
+    west, south, east, north = database.bounds_m
+    area_km2 = (east - west) * (north - south) * 1e-6
+    print(f"buildings        {len(database)}")
+    print(f"stars            {len(database.stars)}")
+    print(f"CRS              EPSG:{database.epsg}")
+    print(f"bounds           {west:.0f} {south:.0f} {east:.0f} {north:.0f} m (west south east north)")
+    print(f"density          {len(database) / max(area_km2, 1e-6):.0f} buildings/km2 of the bounds")
+    print(f"descriptor hash  {database.descriptor_hash}")
+    print(f"file size        {args.database.stat().st_size / 1e6:.1f} MB")
+    return 0
+
+
+def _empty_folder(path: Path) -> Path:
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise BuildlocError(f"{path}: exists and is not an empty folder; choose another --out")
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def _segment(args: argparse.Namespace) -> int:
+    import cv2
+    from buildloc_msgs_py.pairing import FrameFault
+    from buildloc_segmenter.config import SegmenterConfig
+    from buildloc_segmenter.segmenter import Segmenter
+
+    from buildloc.bag import read_frames
+    from buildloc.settings import SEGMENTER, config_of, load
+
+    segmenter = Segmenter(config_of(load(args.config, args.overrides), SEGMENTER, SegmenterConfig))
+    frames = faults = keyframes = 0
+    for frame in read_frames(args.bag):
+        if isinstance(frame, FrameFault):
+            faults += 1
+            print(f"warning: frame {frame.stamp_ns}: {frame.reason}", file=sys.stderr)
+            continue
+        if frames == 0:
+            _empty_folder(args.out)
+        frames += 1
+        mask = segmenter.process(frame)
+        if mask is not None:
+            keyframes += 1
+            cv2.imwrite(str(args.out / f"{mask.stamp_ns}.png"), mask.pixels)
+            _progress(f"{frames} frames, {keyframes} keyframes")
+    _progress_end()
+    if frames == 0:
+        raise BuildlocError(f"{args.bag}: none of {faults} images can be used; see the warnings above")
+    print(f"{args.out}: {keyframes} masks of {frames} frames, {faults} frames unusable")
+    return 0
+
+
+def _map(args: argparse.Namespace) -> int:
+    from buildloc_mapper.config import MapperConfig
+    from buildloc_mapper.mapper import Mapper
+    from buildloc_msgs_py.pairing import FrameFault
+    from buildloc_segmenter.config import SegmenterConfig
+    from buildloc_segmenter.segmenter import Segmenter
+
+    from buildloc.bag import read_frames
+    from buildloc.mapfile import write_map, write_tum
+    from buildloc.settings import MAPPER, SEGMENTER, config_of, load
+
+    settings = load(args.config, args.overrides)
+    segmenter = Segmenter(config_of(settings, SEGMENTER, SegmenterConfig))
+    mapper = Mapper(config_of(settings, MAPPER, MapperConfig))
+    update = None
+    for frame in read_frames(args.bag):
+        if isinstance(frame, FrameFault):
+            print(f"warning: frame {frame.stamp_ns}: {frame.reason}", file=sys.stderr)
+            continue
+        mask = segmenter.process(frame)
+        update = (mapper.add(frame, mask) if mask is not None else None) or update
+        if update is not None:
+            _progress(f"{len(update.keyframes)} keyframes, {len(update.local_map)} buildings")
+    _progress_end()
+    if update is None:
+        raise BuildlocError(f"{args.bag}: gave no map; see the warnings above")
+    write_map(update.outlines, update.local_map, args.out)
+    print(f"{args.out}: {len(update.local_map)} buildings from {len(update.keyframes)} keyframes")
+    if args.trajectory is not None:
+        write_tum(update.keyframes, args.trajectory)
+        print(f"{args.trajectory}: {len(update.keyframes)} poses (TUM)")
+    return 0
+
+
+def _locate(args: argparse.Namespace) -> int:
+    from buildloc_matcher.config import MatcherConfig
+    from buildloc_matcher.database import open_database
+    from buildloc_matcher.matcher import Matcher
+
+    from buildloc.mapfile import read_map
+    from buildloc.settings import MATCHER, config_of, load
+
+    config = config_of(load(args.config, args.overrides), MATCHER, MatcherConfig)
+    matcher = Matcher(open_database(args.database, config), config)
+    found = matcher.locate(read_map(args.map))
+    refused = matcher.refuse(found)
+    ranked: list[dict[str, Any]] = []
+    for candidate in found.candidates:
+        latitude, longitude = matcher.database.to_wgs84(candidate.x_m, candidate.y_m)
+        ranked.append(
+            {
+                "latitude_deg": latitude, "longitude_deg": longitude,
+                "easting_m": candidate.x_m, "northing_m": candidate.y_m,
+                "yaw_deg": math.degrees(candidate.yaw_rad), "scale": candidate.scale, "votes": candidate.votes,
+                "mnn_jaccard": candidate.mnn_jaccard, "acceptance": candidate.acceptance,
+            }
+        )  # fmt: skip
+    fix = ranked[0] if refused is None else None
+    if args.json:
+        answer = {"fix": fix, "reason": refused, "candidates": ranked, "funnel": found.funnel}
+        print(json.dumps(answer, indent=2))
+        return 0
+    print("rank  latitude    longitude    yaw_deg  scale  votes  jaccard")
+    for rank, row in enumerate(ranked, start=1):
+        print(
+            f"{rank:4d}  {row['latitude_deg']:10.6f}  {row['longitude_deg']:11.6f}  {row['yaw_deg']:7.1f}  "
+            f"{row['scale']:5.3f}  {row['votes']:5.1f}  {row['mnn_jaccard']:7.3f}"
+        )
+    place = "the middle of the map's buildings"
+    if fix is None:
+        print(f"no fix: {refused}")
+    else:
+        print(f"fix: {place} is at {fix['latitude_deg']:.6f}, {fix['longitude_deg']:.6f}")
+    return 0
+
+
+def _run(args: argparse.Namespace) -> int:
+    from buildloc_mapper.config import MapperConfig
+    from buildloc_matcher.config import MatcherConfig
+    from buildloc_matcher.database import open_database
+    from buildloc_msgs_py.pairing import FrameFault
+    from buildloc_msgs_py.types import Fix, NoFix
+    from buildloc_segmenter.config import SegmenterConfig
+
+    from buildloc.bag import read_frames
+    from buildloc.localizer import Localizer
+    from buildloc.records import record
+    from buildloc.settings import MAPPER, MATCHER, SEGMENTER, config_of, load
+
+    settings = load(args.config, args.overrides)
+    matcher_config = config_of(settings, MATCHER, MatcherConfig)
+    localizer = Localizer(
+        open_database(args.database, matcher_config), config_of(settings, SEGMENTER, SegmenterConfig),
+        config_of(settings, MAPPER, MapperConfig), matcher_config,
+    )  # fmt: skip
+    results: list[Fix | NoFix] = []
+    usable = 0
+    for frame in read_frames(args.bag):
+        if isinstance(frame, FrameFault):
+            print(f"warning: frame {frame.stamp_ns}: {frame.reason}", file=sys.stderr)
+            results.append(NoFix(frame.stamp_ns, frame.reason))
+            continue
+        usable += 1
+        answer = localizer.process(frame)
+        if answer is not None:
+            results.append(answer.result)
+            print(describe(answer.result), flush=True)
+    if usable == 0:
+        raise BuildlocError(f"{args.bag}: no image can be used: {results[0].reason if results else 'it has none'}")  # type: ignore[union-attr]
+    if args.out is not None:
+        args.out.write_text("".join(json.dumps(record(result)) + "\n" for result in results))
+    fixes = sum(isinstance(result, Fix) for result in results)
+    print(f"{fixes} fixes at {len(results)} keyframes or unusable frames")
+    return 0
+
+
+def describe(result: Any) -> str:
+    """One line for a fix or its absence."""
+    from buildloc_msgs_py.types import NoFix
+
+    seconds = f"{result.stamp_ns * 1e-9:.3f}"
+    if isinstance(result, NoFix):
+        return f"{seconds}  no fix: {result.reason}"
+    sigma = math.sqrt((result.covariance_enu_m2[0, 0] + result.covariance_enu_m2[1, 1]) / 2.0)
+    return f"{seconds}  {result.latitude_deg:.6f} {result.longitude_deg:.6f}  sigma {sigma:.1f} m"
+
+
+def _replay(args: argparse.Namespace) -> int:
+    from buildloc_msgs_py.types import Fix
+
+    from buildloc.records import read_fixes
+    from buildloc.settings import NODES, REFERENCE_DB, load
+    from buildloc.supervisor import dds_environment
+
+    os.environ.update(dds_environment())
+    from buildloc.replay import replay
+
+    settings = load(args.config, args.overrides)
+    if args.database is not None:
+        settings[REFERENCE_DB]["database"] = str(args.database.resolve())
+    for node in NODES:
+        settings[node]["use_sim_time"] = True
+    with tempfile.TemporaryDirectory(prefix="buildloc-") as folder:
+        fixes = args.out or Path(folder) / "fixes.jsonl"
+        report = replay(args.bag, None if args.no_nodes else settings, args.rate, Path(folder), fixes)
+        results = read_fixes(fixes)
+    accepted = [result for result in results if isinstance(result, Fix)]
+    for result in accepted:
+        print(describe(result))
+    print(
+        f"{len(accepted)} fixes received on /buildloc/fix; {report.images} images, {report.dropped} dropped, "
+        f"{report.frames_unusable} unusable, {report.keyframes} keyframes, {report.maps} maps, "
+        f"{report.maps_skipped} overtaken; {report.seconds:.1f} s"
+    )
+    return 0
+
+
+def _launch(args: argparse.Namespace) -> int:
+    from buildloc.settings import REFERENCE_DB, load
+    from buildloc.supervisor import Supervisor, supervise
+
+    settings = load(args.config, args.overrides)
+    if args.database is not None:
+        settings[REFERENCE_DB]["database"] = str(args.database.resolve())
+    with tempfile.TemporaryDirectory(prefix="buildloc-") as folder:
+        return supervise(Supervisor(settings, Path(folder)))
+
+
+def _command(
+    subparsers: Any, name: str, text: str, run: Run, *arguments: tuple[tuple[str, ...], dict[str, Any]]
+) -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = subparsers.add_parser(name, help=text, description=text)
+    for flags, options in arguments:
+        parser.add_argument(*flags, **options)
+    parser.set_defaults(run=run)
+    return parser
+
+
+def _argument(*flags: str, **options: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
+    return flags, options
+
+
+def parser() -> argparse.ArgumentParser:
+    """All commands, those that other packages register under ``buildloc.commands`` among them."""
+    top = argparse.ArgumentParser(prog="buildloc", description="position from the pattern of buildings below")
+    top.add_argument("--version", action="version", version=f"buildloc {importlib.metadata.version('buildloc')}")
+    commands = top.add_subparsers(dest="command", required=True)
+    refdb = commands.add_parser("refdb", help="reference databases of building footprints")
+    refdb_commands = refdb.add_subparsers(dest="refdb_command", required=True)
+    bag = _argument("bag", type=Path, help="rosbag2 folder or MCAP file")
+    database = _argument("--database", type=Path, required=True, help="reference database")
+    with_settings = [
+        _command(
+            refdb_commands, "build", "describe building footprints", _refdb_build,
+            _argument("sources", type=Path, nargs="+", help="GeoJSON or GeoParquet files"),
+            _argument("--out", type=Path, required=True, help="database file to write"),
+            _argument("--center", type=_location, metavar="LAT,LON", help="keep what lies around here"),
+            _argument("--radius-km", type=float, help="how far around the centre, km"),
+        ),
+        _command(refdb_commands, "info", "what a database holds", _refdb_info, _argument("database", type=Path)),
+        _command(
+            commands, "segment", "building masks of a bag's keyframes", _segment, bag,
+            _argument("--out", type=Path, required=True, help="folder for one PNG per keyframe"),
+        ),
+        _command(
+            commands, "map", "map file and trajectory of a bag", _map, bag,
+            _argument("--out", type=Path, required=True, help="GeoJSON or GeoParquet of building polygons, local metres"),
+            _argument("--trajectory", type=Path, help="keyframe poses in TUM format"),
+        ),
+        _command(
+            commands, "locate", "ranked candidates and fix of a map file", _locate,
+            _argument("database", type=Path, help="reference database"),
+            _argument("map", type=Path, help="GeoJSON or GeoParquet of building polygons, local metres"),
+            _argument("--json", action="store_true", help="machine-readable answer"),
+        ),
+        _command(
+            commands, "run", "fixes of a bag, offline and deterministic", _run, bag, database,
+            _argument("--out", type=Path, help="JSON lines, one per keyframe"),
+        ),
+        _command(
+            commands, "replay", "play a bag into the live nodes", _replay, bag,
+            _argument("--database", type=Path, help="reference database"),
+            _argument("--rate", type=float, default=1.0, help="speed relative to the recording"),
+            _argument("--out", type=Path, help="JSON lines of what arrived on /buildloc/fix"),
+            _argument("--no-nodes", action="store_true", help="the nodes run already, elsewhere"),
+        ),
+        _command(
+            commands, "launch", "start the nodes and keep them together until SIGINT", _launch,
+            _argument("--database", type=Path, help="reference database"),
+        ),
+    ]  # fmt: skip
+    for command in with_settings:
+        _settings_arguments(command)
+    for entry in sorted(importlib.metadata.entry_points(group=EXTENSIONS), key=lambda e: e.name):
+        text, add_arguments, run = entry.load()
+        added = _command(commands, entry.name, text, run)
+        add_arguments(added)
+    return top
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; expected errors are one line and status 2."""
+    args = parser().parse_args(argv)
+    run: Run = args.run
+    try:
+        return run(args)
+    except BuildlocError as error:
+        _progress_end()
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())
