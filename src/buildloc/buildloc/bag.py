@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,9 @@ class BagError(BuildlocError):
     """A bag cannot be used."""
 
 
-def open_bag(path: Path) -> AnyReader:
-    """An open reader; the caller closes it. Raises BagError for a missing, damaged or empty bag."""
+@contextmanager
+def open_bag(path: Path) -> Iterator[AnyReader]:
+    """A reader, open within the context. Raises BagError for a missing, damaged or empty bag."""
     if not path.exists():
         raise BagError(f"{path}: no such bag; give the folder of a rosbag2 recording")
     if path.is_dir() and not (path / "metadata.yaml").is_file():
@@ -32,10 +34,12 @@ def open_bag(path: Path) -> AnyReader:
         reader.open()
     except Exception as error:  # rosbags and the storage libraries raise many kinds on damaged files
         raise BagError(f"{path}: bag is truncated or damaged ({_line(error)}); record or copy it again") from error
-    if reader.message_count == 0:
+    try:
+        if reader.message_count == 0:
+            raise BagError(f"{path}: bag holds no messages; record the flight again")
+        yield reader
+    finally:
         reader.close()
-        raise BagError(f"{path}: bag holds no messages; record the flight again")
-    return reader
 
 
 def _line(error: Exception) -> str:
@@ -73,8 +77,7 @@ def read_frames(path: Path) -> Iterator[Frame | FrameFault]:
 
     Raises BagError when the bag is missing, damaged, empty or lacks a needed topic.
     """
-    reader = open_bag(path)
-    with reader:
+    with open_bag(path) as reader:
         require_topics(reader, path)
         pairing = FramePairing()
         for connection, _, data in raw_messages(reader, path, {*TELEMETRY, *IMAGES}):

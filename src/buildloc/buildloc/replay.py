@@ -143,8 +143,7 @@ def _wait(condition: Callable[[], bool], timeout_s: float, alive: Callable[[], N
 def _play(node: ReplayNode, bag: Path, rate: float, alive: Callable[[], None]) -> int:
     """Publish everything in time; returns the number of images."""
     published: Counter[str] = Counter()
-    reader = open_bag(bag)
-    with reader:
+    with open_bag(bag) as reader:
         started, first_ns = time.monotonic(), reader.start_time
         for connection, stamp_ns, data in raw_messages(reader, bag):
             publisher = node.outputs.get(connection.topic)
@@ -179,8 +178,7 @@ def replay(bag: Path, settings: Settings | None, rate: float, folder: Path, fixe
     """
     if not rate > 0.0:
         raise ReplayError(f"rate {rate:g} is not positive; 1 is real time")
-    reader = open_bag(bag)
-    with reader:
+    with open_bag(bag) as reader:
         require_topics(reader, bag)
         recorded = {c.topic: c.msgtype for c in reader.connections if not c.topic.startswith("/buildloc/")}
     with ExitStack() as stack:
