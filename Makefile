@@ -28,7 +28,7 @@ $(LOCKED): requirements.lock
 	@touch $@
 
 $(INSTALLED): $(LOCKED) $(wildcard $(PACKAGES:%=%/setup.py) $(PACKAGES:%=%/setup.cfg))
-	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation $(PACKAGES:%=-e %)
+	PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --no-deps --no-build-isolation $(PACKAGES:%=-e %)
 	@touch $@
 
 #: make demo       database, nodes, replay of the sample bag; fixes and a picture in out/demo

@@ -25,6 +25,7 @@ setup(
         "shapely>=2.0,<3",
         "pyproj>=3.6,<4",
         "geopandas>=1.0,<2",
+        "pandas>=2.2,<4",
         "pyarrow>=14,<30",
     ],
     extras_require={"ros": ["buildloc_msgs_py[ros]"], "test": ["pytest"]},
