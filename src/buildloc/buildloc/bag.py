@@ -33,7 +33,9 @@ def open_bag(path: Path) -> Iterator[AnyReader]:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
         reader.open()
     except Exception as error:  # rosbags and the storage libraries raise many kinds on damaged files
-        raise BagError(f"{path}: bag is truncated or damaged ({_line(error)}); record or copy it again") from error
+        raise BagError(
+            f"{path}: bag is truncated or damaged ({_line(error)}); record or copy it again"
+        ) from error
     try:
         if reader.message_count == 0:
             raise BagError(f"{path}: bag holds no messages; record the flight again")
@@ -60,7 +62,9 @@ def require_topics(reader: AnyReader, path: Path) -> None:
         )
 
 
-def raw_messages(reader: AnyReader, path: Path, names: set[str] | None = None) -> Iterator[tuple[Any, int, bytes]]:
+def raw_messages(
+    reader: AnyReader, path: Path, names: set[str] | None = None
+) -> Iterator[tuple[Any, int, bytes]]:
     """(connection, time in ns, CDR bytes) in order of recording, of the topics named (without slash) or all.
 
     Raises BagError where the recording is damaged.
@@ -69,7 +73,9 @@ def raw_messages(reader: AnyReader, path: Path, names: set[str] | None = None) -
     try:
         yield from reader.messages(wanted)
     except Exception as error:
-        raise BagError(f"{path}: bag is truncated or damaged ({_line(error)}); record or copy it again") from error
+        raise BagError(
+            f"{path}: bag is truncated or damaged ({_line(error)}); record or copy it again"
+        ) from error
 
 
 def read_frames(path: Path) -> Iterator[Frame | FrameFault]:

@@ -30,7 +30,7 @@ def _location(text: str) -> tuple[float, float]:
 
 
 def _settings_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--config", type=Path, help="YAML of ROS parameters (default: the installed buildloc.yaml)")
+    parser.add_argument("--config", type=Path, help="YAML of ROS parameters")
     parser.add_argument(
         "--set", action="append", default=[], metavar="NODE.PARAMETER=VALUE", dest="overrides",
         help="override one parameter, e.g. segmenter_node.model=net.onnx; repeatable",
@@ -72,7 +72,9 @@ def _refdb_info(args: argparse.Namespace) -> int:
 
     from buildloc.settings import REFERENCE_DB, config_of, load
 
-    database = open_database(args.database, config_of(load(args.config, args.overrides), REFERENCE_DB, MatcherConfig))
+    database = open_database(
+        args.database, config_of(load(args.config, args.overrides), REFERENCE_DB, MatcherConfig)
+    )
     west, south, east, north = database.bounds_m
     area_km2 = (east - west) * (north - south) * 1e-6
     print(f"buildings        {len(database)}")
@@ -231,7 +233,7 @@ def _run(args: argparse.Namespace) -> int:
             results.append(answer.result)
             print(describe(answer.result), flush=True)
     if usable == 0:
-        raise BuildlocError(f"{args.bag}: no image can be used: {results[0].reason if results else 'it has none'}")  # type: ignore[union-attr]
+        raise BuildlocError(f"{args.bag}: no image can be used; the warnings above say why")
     if args.out is not None:
         args.out.write_text("".join(json.dumps(record(result)) + "\n" for result in results))
     fixes = sum(isinstance(result, Fix) for result in results)
@@ -308,7 +310,9 @@ def _argument(*flags: str, **options: Any) -> tuple[tuple[str, ...], dict[str, A
 def parser() -> argparse.ArgumentParser:
     """All commands, those that other packages register under ``buildloc.commands`` among them."""
     top = argparse.ArgumentParser(prog="buildloc", description="position from the pattern of buildings below")
-    top.add_argument("--version", action="version", version=f"buildloc {importlib.metadata.version('buildloc')}")
+    top.add_argument(
+        "--version", action="version", version=f"buildloc {importlib.metadata.version('buildloc')}"
+    )
     commands = top.add_subparsers(dest="command", required=True)
     refdb = commands.add_parser("refdb", help="reference databases of building footprints")
     refdb_commands = refdb.add_subparsers(dest="refdb_command", required=True)
@@ -329,13 +333,13 @@ def parser() -> argparse.ArgumentParser:
         ),
         _command(
             commands, "map", "map file and trajectory of a bag", _map, bag,
-            _argument("--out", type=Path, required=True, help="GeoJSON or GeoParquet of building polygons, local metres"),
+            _argument("--out", type=Path, required=True, help="GeoJSON or GeoParquet, local metres"),
             _argument("--trajectory", type=Path, help="keyframe poses in TUM format"),
         ),
         _command(
             commands, "locate", "ranked candidates and fix of a map file", _locate,
             _argument("database", type=Path, help="reference database"),
-            _argument("map", type=Path, help="GeoJSON or GeoParquet of building polygons, local metres"),
+            _argument("map", type=Path, help="GeoJSON or GeoParquet, local metres"),
             _argument("--json", action="store_true", help="machine-readable answer"),
         ),
         _command(

@@ -1,6 +1,6 @@
 """A subscriber as an integrator would write it: prints every message of /buildloc/fix, one JSON line each.
 
-    python -m buildloc.fix_listener [--out FIXES.jsonl]
+python -m buildloc.fix_listener [--out FIXES.jsonl]
 """
 
 from __future__ import annotations

@@ -53,5 +53,7 @@ def read_fixes(path: Path) -> list[Fix | NoFix]:
         try:
             fixes.append(parse(json.loads(line)))
         except (ValueError, KeyError, TypeError) as error:
-            raise RecordError(f"{path}:{number}: is not a fix record; write it with `buildloc run --out`") from error
+            raise RecordError(
+                f"{path}:{number}: is not a fix record; write it with `buildloc run --out`"
+            ) from error
     return fixes

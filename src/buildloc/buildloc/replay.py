@@ -10,7 +10,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -97,7 +97,9 @@ class ReplayNode(Node):  # type: ignore[misc]
     def connected(self) -> bool:
         """Whether the nodes subscribe to all inputs that are offered."""
         wanted = ((self.outputs.get(f"/{topic}"), n) for topic, n in SUBSCRIBERS.items())
-        return all(publisher.get_subscription_count() >= n for publisher, n in wanted if publisher is not None)
+        return all(
+            publisher.get_subscription_count() >= n for publisher, n in wanted if publisher is not None
+        )
 
     def ready(self) -> bool:
         """Whether all nodes speak and the reference was loaded or refused."""
@@ -124,10 +126,8 @@ class ReplayNode(Node):  # type: ignore[misc]
 
 
 def _spin(executor: SingleThreadedExecutor) -> None:
-    try:
+    with suppress(ExternalShutdownException):
         executor.spin()
-    except ExternalShutdownException:
-        pass
 
 
 def _wait(condition: Callable[[], bool], timeout_s: float, alive: Callable[[], None]) -> bool:

@@ -12,7 +12,12 @@ from buildloc_msgs_py.config import ConfigError, from_mapping
 
 ConfigT = TypeVar("ConfigT")
 Settings = dict[str, dict[str, Any]]
-SEGMENTER, MAPPER, MATCHER, REFERENCE_DB = "segmenter_node", "mapper_node", "matcher_node", "reference_db_node"
+SEGMENTER, MAPPER, MATCHER, REFERENCE_DB = (
+    "segmenter_node",
+    "mapper_node",
+    "matcher_node",
+    "reference_db_node",
+)
 NODES = (REFERENCE_DB, SEGMENTER, MAPPER, MATCHER)
 NOT_CONFIG = ("use_sim_time", "database")
 
@@ -36,13 +41,17 @@ def load(path: Path | None = None, overrides: Sequence[str] = ()) -> Settings:
     for node, block in (document or {}).items():
         parameters = block.get("ros__parameters") if isinstance(block, Mapping) else None
         if node not in settings or not isinstance(parameters, Mapping):
-            raise ConfigError(f"{path}: expected `NODE: {{ros__parameters: ...}}` for {', '.join(NODES)}, not {node}")
+            raise ConfigError(
+                f"{path}: expected `NODE: {{ros__parameters: ...}}` for {', '.join(NODES)}, not {node}"
+            )
         settings[node].update(parameters)
     for text in overrides:
         name, equals, value = text.partition("=")
         node, dot, parameter = name.partition(".")
         if not (equals and dot) or node not in settings:
-            raise ConfigError(f"--set {text}: expected NODE.PARAMETER=VALUE with NODE one of {', '.join(NODES)}")
+            raise ConfigError(
+                f"--set {text}: expected NODE.PARAMETER=VALUE with NODE one of {', '.join(NODES)}"
+            )
         settings[node][parameter] = yaml.safe_load(value)
     return settings
 

@@ -6,10 +6,10 @@ import math
 from pathlib import Path
 
 import pytest
-from tiny_bags import HEIGHT, SECOND, WIDTH, truncate, write_bag
 from buildloc.bag import BagError, read_frames
 from buildloc_msgs_py.pairing import FrameFault
 from buildloc_msgs_py.types import Frame
+from tiny_bags import HEIGHT, SECOND, WIDTH, truncate, write_bag
 
 
 def test_frames_come_in_order_with_their_telemetry(tmp_path: Path) -> None:
@@ -28,7 +28,7 @@ def test_a_missing_bag(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_is_no_bag(tmp_path: Path) -> None:
-    with pytest.raises(BagError, match="without metadata.yaml"):
+    with pytest.raises(BagError, match=r"without metadata\.yaml"):
         next(read_frames(tmp_path))
 
 
@@ -43,7 +43,9 @@ def test_an_empty_bag(tmp_path: Path) -> None:
         list(read_frames(write_bag(tmp_path / "bag", frames=0)))
 
 
-@pytest.mark.parametrize("topic", ["/camera/image/compressed", "/camera/camera_info", "/altitude", "/gimbal/attitude"])
+@pytest.mark.parametrize(
+    "topic", ["/camera/image/compressed", "/camera/camera_info", "/altitude", "/gimbal/attitude"]
+)
 def test_a_bag_without_a_needed_topic(tmp_path: Path, topic: str) -> None:
     with pytest.raises(BagError, match=f"no messages on .*{topic[1:]}.*record the missing topics"):
         list(read_frames(write_bag(tmp_path / "bag", without=(topic,))))

@@ -27,7 +27,9 @@ class MapperConfig:
     sigma_log_scale: float = param(0.01, "standard deviation of a link's log scale", 1e-5, 1.0)
     sigma_unit_scale: float = param(0.02, "standard deviation of the unit-scale prior", 1e-5, 1.0)
     loop_weight: float = param(2.0, "weight of a loop closure relative to a consecutive link", 0.01, 100.0)
-    huber_k: float = param(1.345, "residual in standard deviations where the Huber loss turns linear", 0.1, 10.0)
+    huber_k: float = param(
+        1.345, "residual in standard deviations where the Huber loss turns linear", 0.1, 10.0
+    )
     map_gsd_m: float = param(0.25, "ground sampling distance of the fused map, m", 0.05, 5.0)
     min_observations: int = param(2, "fewest keyframes that must see a building pixel", 1, 100)
     min_share: float = param(0.5, "smallest share of the views of a pixel that call it building", 0.01, 1.0)

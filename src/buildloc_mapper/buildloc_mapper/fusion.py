@@ -85,7 +85,9 @@ def fuse(views: Sequence[View], poses: Sequence[Similarity], config: MapperConfi
     for view, pose, quad in zip(views, poses, corners, strict=True):
         c0, r0 = np.floor([(quad[:, 0].min() - left) / gsd, (top - quad[:, 1].max()) / gsd]).astype(int)
         c1, r1 = np.ceil([(quad[:, 0].max() - left) / gsd, (top - quad[:, 1].min()) / gsd]).astype(int)
-        pixel_to_map = np.array([[gsd, 0.0, left + (c0 + 0.5) * gsd], [0.0, -gsd, top - (r0 + 0.5) * gsd], [0, 0, 1.0]])
+        pixel_to_map = np.array(
+            [[gsd, 0.0, left + (c0 + 0.5) * gsd], [0.0, -gsd, top - (r0 + 0.5) * gsd], [0, 0, 1.0]]
+        )
         homography = view.level_to_pixels() @ _map_to_level(pose) @ pixel_to_map
         size = (int(c1 - c0), int(r1 - r0))
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

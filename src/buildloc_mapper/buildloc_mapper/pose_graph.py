@@ -66,8 +66,6 @@ def optimize(poses: Sequence[Similarity], edges: Sequence[Edge], config: MapperC
         graph.add(gtsam.PriorFactorSimilarity2(i, _to_gtsam(prior), anchor if i == 0 else unit))
     for edge in edges:
         noise = _edge_noise(edge, config)
-        graph.add(
-            gtsam.BetweenFactorSimilarity2(edge.earlier, edge.later, _to_gtsam(edge.transform), noise)
-        )
+        graph.add(gtsam.BetweenFactorSimilarity2(edge.earlier, edge.later, _to_gtsam(edge.transform), noise))
     result = gtsam.LevenbergMarquardtOptimizer(graph, initial).optimize()
     return [_from_gtsam(result.atSimilarity2(i)) for i in range(len(poses))]

@@ -1,4 +1,4 @@
-"""Registers two keyframes: SIFT correspondences on the ground and a RANSAC similarity (paper, map stitching)."""
+"""Registers two keyframes: SIFT correspondences on the ground and a RANSAC similarity (map stitching)."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def extract(frame: Frame, config: MapperConfig) -> Features:
     shrink = min(1.0, config.feature_width_px / grey.shape[1])
     if shrink < 1.0:
         grey = cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-    keypoints, descriptors = cv2.SIFT_create(nfeatures=config.features).detectAndCompute(grey, None)
+    keypoints, descriptors = cv2.SIFT.create(nfeatures=config.features).detectAndCompute(grey, None)
     if descriptors is None:
         return Features(np.empty((0, 2)), np.empty((0, 128), dtype=np.float32))
     # Pixel centres are whole numbers, so shrinking maps u to (u + 0.5) shrink - 0.5.

@@ -22,7 +22,12 @@ GSD = 0.2
 SIDE = 1200  # world of 240 m, origin at its centre, y up
 CAMERA = CameraModel(480, 360, 400.0, 400.0, 239.5, 179.5)
 LEVEL = (0.0, 0.0, 0.0, 1.0)
-BUILDINGS = [(-40.0, -10.0, 14.0, 9.0), (-5.0, 12.0, 10.0, 10.0), (30.0, -8.0, 18.0, 8.0), (55.0, 20.0, 9.0, 12.0)]
+BUILDINGS = [
+    (-40.0, -10.0, 14.0, 9.0),
+    (-5.0, 12.0, 10.0, 10.0),
+    (30.0, -8.0, 18.0, 8.0),
+    (55.0, 20.0, 9.0, 12.0),
+]
 
 
 def world() -> tuple[ByteArray, ByteArray]:
@@ -35,7 +40,7 @@ def world() -> tuple[ByteArray, ByteArray]:
     grey = np.clip(110 + noise, 0, 255).astype(np.uint8)
     mask = np.zeros((SIDE, SIDE), dtype=np.uint8)
     for x, y, w, h in BUILDINGS:
-        c0, r0 = (int(round(v / GSD)) for v in (x - w / 2 + SIDE * GSD / 2, SIDE * GSD / 2 - y - h / 2))
+        c0, r0 = (round(v / GSD) for v in (x - w / 2 + SIDE * GSD / 2, SIDE * GSD / 2 - y - h / 2))
         mask[r0 : r0 + int(h / GSD), c0 : c0 + int(w / GSD)] = 255
     grey[mask > 0] = np.clip(grey[mask > 0].astype(int) + 60, 0, 255)
     return np.repeat(grey[:, :, None], 3, axis=2), mask
@@ -143,7 +148,10 @@ def test_fusion_counts_views_and_drops_what_one_view_alone_claims() -> None:
     assert fused.seen.max() == 3
     alone = fuse(views[:2], [pose] * 2, config)
     assert np.array_equal(fused.confirmed(config), alone.confirmed(config))
-    assert fused.confirmed(replace(config, min_observations=1, min_share=0.3)).sum() > alone.confirmed(config).sum()
+    assert (
+        fused.confirmed(replace(config, min_observations=1, min_share=0.3)).sum()
+        > alone.confirmed(config).sum()
+    )
 
 
 def test_extraction_leaves_out_buildings_that_were_not_seen_whole() -> None:

@@ -41,7 +41,7 @@ def refuse_coarse(score: Score, lead_ratio: float, config: MatcherConfig) -> str
     if score.jaccard < config.min_jaccard:
         return f"best candidate has MNN-Jaccard {score.jaccard:.2f}, below {config.min_jaccard:g}"
     if lead_ratio < config.min_lead:
-        return f"best candidate leads another pose by a factor of only {lead_ratio:.2f}, below {config.min_lead:g}"
+        return f"best candidate leads another pose only {lead_ratio:.2f} times, below {config.min_lead:g}"
     if score.pairs < config.min_pairs:
         return f"best candidate matches {score.pairs} buildings, fewer than {config.min_pairs}"
     if score.rms_m > config.max_residual_m:

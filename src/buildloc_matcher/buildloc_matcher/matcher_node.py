@@ -51,7 +51,12 @@ class MatcherNode(Node):  # type: ignore[misc]
         for kind, topic, profile, handle in (
             (CameraInfo, topics.CAMERA_INFO, qos.SENSOR, partial(telemetry, topics.CAMERA_INFO)),
             (Range, topics.ALTITUDE, qos.SENSOR, partial(telemetry, topics.ALTITUDE)),
-            (QuaternionStamped, topics.GIMBAL_ATTITUDE, qos.SENSOR, partial(telemetry, topics.GIMBAL_ATTITUDE)),
+            (
+                QuaternionStamped,
+                topics.GIMBAL_ATTITUDE,
+                qos.SENSOR,
+                partial(telemetry, topics.GIMBAL_ATTITUDE),
+            ),
             (Image, topics.MASK, qos.SENSOR, partial(self._guarded, self._on_mask)),
             (PointCloud2, topics.MAP, qos.SENSOR, partial(self._guarded, self._on_map)),
             (Path, topics.KEYFRAMES, qos.SENSOR, partial(self._guarded, self._on_keyframes)),
@@ -136,6 +141,7 @@ class MatcherNode(Node):  # type: ignore[misc]
         )
 
     def destroy_node(self) -> None:
+        """Let the running solve end first."""
         self._worker.shutdown(wait=True, cancel_futures=True)
         super().destroy_node()
 

@@ -71,9 +71,7 @@ class Session:
             if mask.pixels.shape != (camera.height, camera.width):
                 size = f"{mask.pixels.shape[1]}x{mask.pixels.shape[0]}"
                 raise BuildlocError(f"mask is {size}, camera_info says {camera.width}x{camera.height}")
-            seen = observe(
-                mask.pixels, mask.stamp_ns, camera, altitude, attitude, self.config.min_area_m2
-            )
+            seen = observe(mask.pixels, mask.stamp_ns, camera, altitude, attitude, self.config.min_area_m2)
         except BuildlocError as error:
             self.telemetry_fault = str(error)
         self.frames_unusable += seen is None

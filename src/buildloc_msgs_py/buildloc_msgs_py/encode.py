@@ -1,4 +1,4 @@
-"""Encode what travels as standard ROS messages. Every number is cast: rclpy corrupts NumPy scalars silently."""
+"""Encode what travels as standard ROS messages. Every number is cast: rclpy corrupts NumPy scalars."""
 
 from __future__ import annotations
 

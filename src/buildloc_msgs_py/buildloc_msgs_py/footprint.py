@@ -28,6 +28,7 @@ class Footprint:
 
     @property
     def shape(self) -> tuple[float, float, float, float]:
+        """The four metrics in the order of SHAPE_METRICS."""
         return self.compactness, self.elongation, self.rectangularity, self.convexity
 
 

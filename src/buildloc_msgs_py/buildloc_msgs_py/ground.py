@@ -45,7 +45,9 @@ def level_matrix(attitude_xyzw: Quaternion) -> FloatArray:
     """
     down = rotation_matrix(attitude_xyzw)[2, :]  # the vertical, seen from the camera
     if down[2] < 0.5:
-        raise BuildlocError("the camera looks more than 60 degrees away from the ground; point the gimbal down")
+        raise BuildlocError(
+            "the camera looks more than 60 degrees away from the ground; point the gimbal down"
+        )
     axis = np.cross(down, [0.0, 0.0, 1.0])
     skew = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
     return np.asarray(np.eye(3) + skew + skew @ skew / (1.0 + down[2]), dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Images paired with the telemetry that belongs to them; one rule for live topics and recorded bags. No ROS."""
+"""Images paired with the telemetry that belongs to them; one rule, live and recorded. No ROS."""
 
 from __future__ import annotations
 

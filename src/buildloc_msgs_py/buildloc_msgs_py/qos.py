@@ -1,4 +1,4 @@
-"""Quality of service profiles. RELIABLE everywhere: large BEST_EFFORT images are lost with default settings."""
+"""Quality of service profiles. RELIABLE everywhere: large BEST_EFFORT images are lost by default."""
 
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 

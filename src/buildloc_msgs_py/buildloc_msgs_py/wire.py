@@ -36,7 +36,9 @@ def _raster(msg: Any, channels: int) -> ByteArray:
     data = _bytes(msg.data)
     height, width, step = int(msg.height), int(msg.width), int(msg.step)
     if height <= 0 or width <= 0 or step < width * channels or data.size != step * height:
-        raise WireError(f"image {width}x{height} with step {step} has {data.size} bytes; the driver is at fault")
+        raise WireError(
+            f"image {width}x{height} with step {step} has {data.size} bytes; the driver is at fault"
+        )
     return data.reshape(height, step)[:, : width * channels].reshape(height, width, channels)
 
 
@@ -65,7 +67,9 @@ def decode_camera_info(msg: Any) -> CameraModel:
     k = np.asarray(msg.k if hasattr(msg, "k") else msg.K, dtype=np.float64)
     distortion = np.asarray(msg.d if hasattr(msg, "d") else msg.D, dtype=np.float64)
     if not (np.isfinite(k).all() and k[0] > 0 and k[4] > 0 and msg.width > 0 and msg.height > 0):
-        raise WireError("camera_info is not calibrated (fx, fy or size is zero); publish the camera's calibration")
+        raise WireError(
+            "camera_info is not calibrated (fx, fy or size is zero); publish the camera's calibration"
+        )
     return CameraModel(
         int(msg.width), int(msg.height), float(k[0]), float(k[4]), float(k[2]), float(k[5]),
         tuple(float(v) for v in distortion),
@@ -93,7 +97,9 @@ def decode_attitude(msg: Any) -> tuple[float, float, float, float]:
 def decode_mask(msg: Any) -> Mask:
     """Building mask of a sensor_msgs/Image mono8."""
     if msg.encoding != "mono8":
-        raise WireError(f"mask encoding {msg.encoding!r} is not mono8; feed /buildloc/mask from the segmenter")
+        raise WireError(
+            f"mask encoding {msg.encoding!r} is not mono8; feed /buildloc/mask from the segmenter"
+        )
     return Mask(stamp_ns(msg), str(msg.header.frame_id), _raster(msg, 1)[:, :, 0].copy())
 
 

@@ -44,7 +44,9 @@ def test_shape_metrics_of_an_l() -> None:
 @given(
     angle=st.floats(-180, 180), factor=st.floats(0.1, 20), dx=st.floats(-1e3, 1e3), dy=st.floats(-1e3, 1e3)
 )
-def test_shape_metrics_do_not_change_under_a_similarity(angle: float, factor: float, dx: float, dy: float) -> None:
+def test_shape_metrics_do_not_change_under_a_similarity(
+    angle: float, factor: float, dx: float, dy: float
+) -> None:
     moved = affinity.translate(affinity.scale(affinity.rotate(L_SHAPE, angle), factor, factor), dx, dy)
     assert footprint(moved).shape == pytest.approx(footprint(L_SHAPE).shape, rel=1e-4)
     assert footprint(moved).area_m2 == pytest.approx(75.0 * factor**2, rel=1e-6)
@@ -170,7 +172,12 @@ def test_an_image_waits_for_telemetry_and_takes_the_nearest_in_any_order() -> No
 
 def test_an_image_without_its_telemetry_is_a_fault_that_names_the_topic() -> None:
     pairing = FramePairing()
-    play(pairing, (topics.CAMERA_INFO, info(1.0)), (topics.ALTITUDE, height(1.0, 90.0)), (topics.IMAGE, image(1.0)))
+    play(
+        pairing,
+        (topics.CAMERA_INFO, info(1.0)),
+        (topics.ALTITUDE, height(1.0, 90.0)),
+        (topics.IMAGE, image(1.0)),
+    )
     (fault,) = pairing.flush()
     assert isinstance(fault, FrameFault) and fault.stamp_ns == 10**9
     assert fault.reason == "no gimbal/attitude received; check that it is published or recorded"
@@ -178,20 +185,33 @@ def test_an_image_without_its_telemetry_is_a_fault_that_names_the_topic() -> Non
 
 def test_a_bad_altitude_is_a_fault_and_never_the_last_good_one() -> None:
     pairing = FramePairing()
-    good = [(topics.CAMERA_INFO, info(1.0)), (topics.ALTITUDE, height(0.8, 90.0)), (topics.GIMBAL_ATTITUDE, attitude(1.0))]
+    good = [
+        (topics.CAMERA_INFO, info(1.0)),
+        (topics.ALTITUDE, height(0.8, 90.0)),
+        (topics.GIMBAL_ATTITUDE, attitude(1.0)),
+    ]
     (fault,) = play(pairing, *good, (topics.IMAGE, image(1.0)), (topics.ALTITUDE, height(1.0, math.nan)))
     assert isinstance(fault, FrameFault) and "altitude nan m is not a positive number" in fault.reason
 
 
 def test_telemetry_that_stopped_is_a_fault() -> None:
     pairing = FramePairing()
-    play(pairing, (topics.CAMERA_INFO, info(1.0)), (topics.ALTITUDE, height(1.0, 90.0)), (topics.GIMBAL_ATTITUDE, attitude(9.0)))
+    play(
+        pairing,
+        (topics.CAMERA_INFO, info(1.0)),
+        (topics.ALTITUDE, height(1.0, 90.0)),
+        (topics.GIMBAL_ATTITUDE, attitude(9.0)),
+    )
     (fault,) = [*play(pairing, (topics.IMAGE, image(9.0))), *pairing.flush()]
     assert isinstance(fault, FrameFault) and "altitude nearest to the image is 8.0 s away" in fault.reason
 
 
 def test_an_image_of_another_size_than_camera_info_is_a_fault() -> None:
     pairing = FramePairing()
-    messages = [(topics.CAMERA_INFO, info(1.0, width=65)), (topics.ALTITUDE, height(1.0, 90.0)), (topics.GIMBAL_ATTITUDE, attitude(1.0))]
+    messages = [
+        (topics.CAMERA_INFO, info(1.0, width=65)),
+        (topics.ALTITUDE, height(1.0, 90.0)),
+        (topics.GIMBAL_ATTITUDE, attitude(1.0)),
+    ]
     (fault,) = play(pairing, *messages, (topics.IMAGE, image(1.0)))
     assert isinstance(fault, FrameFault) and "image is 64x48 but camera_info says 65x48" in fault.reason

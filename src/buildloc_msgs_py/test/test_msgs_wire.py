@@ -24,7 +24,7 @@ def by_rclpy(message: Any) -> Any:
 
 
 def by_rosbags(message: Any) -> Any:
-    package, _, name = type(message).__module__.partition(".msg.")
+    package = type(message).__module__.partition(".msg.")[0]
     return STORE.deserialize_cdr(serialize_message(message), f"{package}/msg/{type(message).__name__}")
 
 
@@ -35,7 +35,9 @@ Travel = Callable[[Any], Any]
 def same(one: Any, other: Any) -> None:
     assert type(one) is type(other)
     for field in fields(one):
-        np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name), err_msg=field.name)
+        np.testing.assert_array_equal(
+            getattr(one, field.name), getattr(other, field.name), err_msg=field.name
+        )
 
 
 @wires
@@ -120,15 +122,18 @@ def test_keyframes(travel: Travel) -> None:
 def test_map(travel: Travel, count: int) -> None:
     rng = np.random.default_rng(count)
     sent = LocalMap(
-        STAMP, np.arange(count, dtype=np.int64), rng.normal(size=(count, 2)) * 100, rng.uniform(20, 500, count),
-        rng.uniform(size=(count, 4)), rng.integers(1, 9, count),
+        STAMP, np.arange(count, dtype=np.int64), rng.normal(size=(count, 2)) * 100,
+        rng.uniform(20, 500, count), rng.uniform(size=(count, 4)), rng.integers(1, 9, count),
     )  # fmt: skip
     same(wire.decode_map(travel(encode.encode_map(sent))), sent)
 
 
 @wires
 def test_candidates(travel: Travel) -> None:
-    sent = (Candidate(3e5, 4.7e6, 1.0, 1.01, 12.5, 0.61, 1.7), Candidate(3e5, 4.8e6, -1.0, 0.99, 2.5, 0.2, 0.5))
+    sent = (
+        Candidate(3e5, 4.7e6, 1.0, 1.01, 12.5, 0.61, 1.7),
+        Candidate(3e5, 4.8e6, -1.0, 0.99, 2.5, 0.2, 0.5),
+    )
     assert wire.decode_candidates(travel(encode.encode_candidates(sent, STAMP))) == sent
     with pytest.raises(wire.WireError, match="point cloud has fields x, y, yaw"):
         wire.decode_map(travel(encode.encode_candidates(sent, STAMP)))

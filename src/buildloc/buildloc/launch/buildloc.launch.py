@@ -1,4 +1,4 @@
-"""ros2 launch buildloc buildloc.launch.py database:=/path/to/reference.bldb [params:=/path/to/params.yaml]"""
+"""The node graph: ros2 launch buildloc buildloc.launch.py database:=FILE [params:=FILE]."""
 
 from pathlib import Path
 
