@@ -326,7 +326,9 @@ def parser() -> argparse.ArgumentParser:
             _argument("--center", type=_location, metavar="LAT,LON", help="keep what lies around here"),
             _argument("--radius-km", type=float, help="how far around the centre, km"),
         ),
-        _command(refdb_commands, "info", "what a database holds", _refdb_info, _argument("database", type=Path)),
+        _command(
+            refdb_commands, "info", "what a database holds", _refdb_info, _argument("database", type=Path)
+        ),
         _command(
             commands, "segment", "building masks of a bag's keyframes", _segment, bag,
             _argument("--out", type=Path, required=True, help="folder for one PNG per keyframe"),
