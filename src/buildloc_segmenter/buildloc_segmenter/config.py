@@ -1,0 +1,52 @@
+"""Every parameter of the segmenter: the keyframe policy and the contract with an ONNX network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from buildloc_msgs_py.config import ConfigError, check, param
+
+LAYOUTS = ("NCHW", "NHWC")
+CHANNEL_ORDERS = ("rgb", "bgr")
+OUTPUTS = ("logits", "probability")
+
+
+@dataclass(frozen=True)
+class SegmenterConfig:
+    """Parameters of keyframe selection, of the network's input and output, and of mask clean-up.
+
+    The defaults of the network contract are those of the network that is shipped.
+    """
+
+    keyframe_rotation_deg: float = param(15.0, "in-plane rotation that makes a keyframe, deg", 0.1, 180.0)
+    keyframe_period_s: float = param(5.0, "time that makes a keyframe, s", 0.0, 3600.0)
+    model: str = param("", "path of an ONNX network; empty: the one that is shipped")
+    providers: tuple[str, ...] = param(("CPUExecutionProvider",), "ONNX Runtime execution providers")
+    threads: int = param(0, "threads of one inference; 0: ONNX Runtime decides", 0, 256)
+    network_gsd_m: float = param(0.2, "ground sampling distance of the training, m; 0: any", 0.0, 10.0)
+    layout: str = param("NCHW", "order of the input's axes: NCHW or NHWC")
+    channel_order: str = param("rgb", "order of the input's channels: rgb or bgr")
+    mean: tuple[float, ...] = param((0.0, 0.0, 0.0), "subtracted from the 0-255 channels, in channel order")
+    std: tuple[float, ...] = param((1.0, 1.0, 1.0), "divides the channels after that, in channel order")
+    input_multiple: int = param(32, "the input's sides are multiples of this, px", 1, 1024)
+    output: str = param("logits", "what the output holds: logits or probability")
+    building_class: int = param(1, "index of the building class when the output has two", 0, 1)
+    threshold: float = param(0.5, "building probability that makes a pixel building", 0.01, 0.99)
+    min_component_m2: float = param(8.0, "smaller specks and holes are removed, m2", 0.0, 1000.0)
+
+
+def check_segmenter(config: SegmenterConfig) -> None:
+    """Raise ConfigError for the first value that is out of range or not among its choices."""
+    check(config)
+    for name, value, choices in (
+        ("layout", config.layout, LAYOUTS),
+        ("channel_order", config.channel_order, CHANNEL_ORDERS),
+        ("output", config.output, OUTPUTS),
+    ):
+        if value not in choices:
+            raise ConfigError(f"parameter {name} = {value} is not one of {', '.join(choices)}")
+    for name, values in (("mean", config.mean), ("std", config.std)):
+        if len(values) != 3:
+            raise ConfigError(f"parameter {name} = {list(values)} does not have three values, one per channel")
+    if not all(value > 0.0 for value in config.std):
+        raise ConfigError(f"parameter std = {list(config.std)} is not positive")
