@@ -24,7 +24,9 @@ $(LOCKED): requirements.lock
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || \
 	  { echo "Python's venv module is missing; run: sudo apt install python3-venv"; exit 1; }
 	$(PYTHON) -m venv --clear $(VENV)
-	$(BIN)/python -m pip install --quiet --require-hashes -r requirements.lock
+	awk '/^[^ #]/ { keep = /^(pip|setuptools)==/ } keep' requirements.lock > $(VENV)/build.lock
+	$(BIN)/python -m pip install --quiet --require-hashes -r $(VENV)/build.lock
+	$(BIN)/python -m pip install --quiet --require-hashes --no-build-isolation -r requirements.lock
 	@touch $@
 
 $(INSTALLED): $(LOCKED) $(wildcard $(PACKAGES:%=%/setup.py) $(PACKAGES:%=%/setup.cfg))
