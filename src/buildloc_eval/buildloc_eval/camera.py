@@ -1,0 +1,73 @@
+"""Photographs a world: plane homography with tilt and heading, exposure, blur and noise."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from buildloc_msgs_py.ground import camera_matrix, level_matrix, pixels_to_level
+from buildloc_msgs_py.types import ByteArray, CameraModel, FloatArray
+
+from buildloc_eval.flight import FlightConfig, focal_px
+from buildloc_eval.world import World
+
+Quaternion = tuple[float, float, float, float]
+
+
+def camera_model(config: FlightConfig) -> CameraModel:
+    """Pinhole without distortion, principal point in the middle."""
+    focal = focal_px(config)
+    centre = ((config.width - 1) / 2.0, (config.height - 1) / 2.0)
+    return CameraModel(config.width, config.height, focal, focal, *centre)
+
+
+def attitude(roll_rad: float, pitch_rad: float, heading_rad: float) -> Quaternion:
+    """Camera axes to level axes: tilt about a horizontal axis first, then heading about the vertical.
+
+    ``heading_rad`` is positive clockwise seen from above, since the level z axis points down.
+    """
+    angle = math.hypot(roll_rad, pitch_rad)
+    half = math.sin(angle / 2.0) / angle if angle > 0.0 else 0.5
+    x, y, w = pitch_rad * half, roll_rad * half, math.cos(angle / 2.0)
+    z_h, w_h = math.sin(heading_rad / 2.0), math.cos(heading_rad / 2.0)
+    return w_h * x - z_h * y, w_h * y + z_h * x, z_h * w, w_h * w
+
+
+def level_to_world(x_m: float, y_m: float, yaw_rad: float) -> FloatArray:
+    """(3, 3) homogeneous transform of the level camera frame to UTM metres."""
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    return np.array([[c, -s, x_m], [s, c, y_m], [0.0, 0.0, 1.0]])
+
+
+def photograph(
+    world: World,
+    camera: CameraModel,
+    pose: tuple[float, float, float, float],
+    attitude_xyzw: Quaternion,
+    config: FlightConfig,
+    rng: np.random.Generator,
+) -> ByteArray:
+    """(H, W, 3) BGR from ``pose`` (x, y, altitude in metres, ENU yaw of image-right)."""
+    x, y, altitude, yaw = pose
+    placed = level_to_world(x, y, yaw)
+    corners_uv = np.array([[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]]) - 0.5
+    corners = pixels_to_level(corners_uv, camera, altitude, attitude_xyzw) @ placed[:2, :2].T + placed[:2, 2]
+    low, high = corners.min(axis=0) - 1.0, corners.max(axis=0) + 1.0
+    window = world.window((float(low[0]), float(low[1]), float(high[0]), float(high[1])))
+    gsd = window.gsd_m
+    # Metres relative to the window keep the homography well conditioned.
+    to_window = np.array(
+        [[1 / gsd, 0, (x - window.left_m) / gsd - 0.5], [0, -1 / gsd, (window.top_m - y) / gsd - 0.5], [0, 0, 1.0]]
+    )
+    rays = camera_matrix(camera) @ level_matrix(attitude_xyzw).T @ np.diag([1.0, -1.0, altitude])
+    homography = to_window @ level_to_world(0.0, 0.0, yaw) @ np.linalg.inv(rays)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    image = cv2.warpPerspective(window.image_bgr, homography, (camera.width, camera.height), flags=flags)
+    sigma = rng.uniform(0.0, config.blur_px)
+    if sigma > 0.1:
+        image = cv2.GaussianBlur(image, (0, 0), sigma)
+    gain = max(0.2, 1.0 + config.exposure * rng.normal())
+    grainy = image.astype(np.float32) * np.float32(gain)
+    grainy += rng.standard_normal(image.shape, dtype=np.float32) * np.float32(config.noise)
+    return np.clip(grainy, 0, 255).astype(np.uint8)
