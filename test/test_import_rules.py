@@ -29,7 +29,7 @@ MAY_IMPORT_ROS = re.compile(
 )
 # One module for each network, and one for the pose graph.
 ONLY_IN = {"onnxruntime": {"buildloc_segmenter.network"}, "gtsam": {"buildloc_mapper.pose_graph"}}
-WORLD_SIMULATION = {f"buildloc_eval.{name}" for name in ("world", "flight", "camera", "sim")}
+WORLD_SIMULATION = {f"buildloc_eval.{name}" for name in ("world", "town", "flight", "camera", "sim")}
 NAMES_GROUND_TRUTH = {"buildloc_msgs_py.topics"}  # where the topic is spelt
 NODE_LINES = 160
 
