@@ -1,0 +1,140 @@
+"""What this package adds to the command line: sim, eval and demo."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import sys
+from pathlib import Path
+
+from buildloc.settings import REFERENCE_DB, load
+from buildloc_msgs_py.config import from_mapping
+from buildloc_msgs_py.errors import BuildlocError
+from buildloc_msgs_py.types import Fix
+
+from buildloc_eval.flight import FlightConfig, fly
+from buildloc_eval.sim import write_flight
+from buildloc_eval.town import write_town
+from buildloc_eval.world import OrthoWorld, TownWorld, World
+
+TOWN_CENTRE_DEG = (47.62, 8.15)
+DEMO_RATE = 4.0
+
+
+def _region(text: str) -> tuple[float, float, float, float]:
+    try:
+        west, south, east, north = (float(v) for v in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not WEST,SOUTH,EAST,NORTH") from None
+    if not (0.0 <= west < east <= 1.0 and 0.0 <= south < north <= 1.0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not WEST,SOUTH,EAST,NORTH in fractions of the world")
+    return west, south, east, north
+
+
+def _progress(done: int, total: int) -> None:
+    if sys.stderr.isatty():
+        print(f"\r{done}/{total} images", end="\n" if done == total else "", file=sys.stderr, flush=True)
+
+
+def add_sim_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `buildloc sim`; every field of FlightConfig is one."""
+    parser.add_argument("--out", type=Path, required=True, help="bag folder to write")
+    world = parser.add_mutually_exclusive_group(required=True)
+    world.add_argument("--ortho", type=Path, help="orthophoto to cut the flight out of (with --georef)")
+    world.add_argument("--world", type=Path, help="GeoJSON of footprints to render the flight over")
+    world.add_argument("--town", type=Path, help="invent a suburb, write its footprints here and render it")
+    parser.add_argument("--georef", type=Path, help="JSON with origin_lat_deg, origin_lon_deg (top left), gsd_m")
+    parser.add_argument("--extent-m", type=float, default=3200.0, help="side of the invented suburb, m")
+    parser.add_argument("--region", type=_region, default=(0.0, 0.0, 1.0, 1.0), help="W,S,E,N fractions to fly in")
+    parser.add_argument("--seed", type=int, default=1, help="seed of everything random")
+    for field in dataclasses.fields(FlightConfig):
+        low, high = field.metadata["low"], field.metadata["high"]
+        parser.add_argument(
+            f"--{field.name.replace('_', '-')}", type=type(field.default), default=field.default,
+            help=f"{field.metadata['doc']} [{low:g}, {high:g}] (default %(default)s)",
+        )  # fmt: skip
+
+
+def _world(args: argparse.Namespace) -> World:
+    if args.ortho is not None:
+        if args.georef is None:
+            raise BuildlocError("--ortho needs --georef; give the JSON that places the orthophoto")
+        return OrthoWorld(args.ortho, args.georef)
+    if args.town is not None:
+        write_town(args.town, args.seed, args.extent_m, TOWN_CENTRE_DEG)
+    return TownWorld(args.town or args.world, args.seed)
+
+
+def run_sim(args: argparse.Namespace) -> int:
+    """`buildloc sim`."""
+    names = [field.name for field in dataclasses.fields(FlightConfig)]
+    config = from_mapping(FlightConfig, {name: getattr(args, name) for name in names})
+    world = _world(args)
+    west, south, east, north = world.bounds_m
+    w, s, e, n = args.region
+    box = (
+        west + w * (east - west), south + s * (north - south),
+        west + e * (east - west), south + n * (north - south),
+    )  # fmt: skip
+    images = write_flight(args.out, world, fly(box, config, args.seed), config, args.seed, _progress)
+    size = sum(file.stat().st_size for file in args.out.iterdir()) / 1e6
+    print(f"{args.out}: {images} images, {size:.1f} MB, EPSG:{world.epsg}, seed {args.seed}")
+    return 0
+
+
+def add_demo_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `buildloc demo`."""
+    parser.add_argument("--bag", type=Path, default=Path("bags/sample"), help="bag with ground truth")
+    parser.add_argument("--footprints", type=Path, default=Path("bags/sample_footprints.geojson"))
+    parser.add_argument("--rate", type=float, default=DEMO_RATE, help="speed relative to the recording")
+    parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder for what is made")
+
+
+def run_demo(args: argparse.Namespace) -> int:
+    """Database, nodes, replay, fixes with their errors, one picture; 1 when nothing was accepted."""
+    from buildloc.supervisor import dds_environment
+
+    os.environ.update(dds_environment())
+    from buildloc_matcher.config import MatcherConfig
+    from buildloc_matcher.database import build, save
+
+    from buildloc_eval.flights import evaluate_live
+
+    args.out.mkdir(parents=True, exist_ok=True)
+    database = args.out / "reference.bldb"
+    built = build([args.footprints], MatcherConfig())
+    save(built, database)
+    print(f"reference: {len(built)} buildings of {args.footprints} -> {database}")
+    settings = load()
+    settings[REFERENCE_DB]["database"] = str(database.resolve())
+    print(f"replaying {args.bag} at {args.rate:g}x through the nodes (rendered imagery, not real)", flush=True)
+    live = evaluate_live(args.bag, built, settings, args.rate, args.out, f"{args.bag} (rendered imagery)")
+    print(live.table)
+    print(live.summary)
+    print(f"picture: {live.picture}")
+    return 0 if any(isinstance(result, Fix) for result in live.results) else 1
+
+
+def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `buildloc eval`."""
+    parser.add_argument("name", choices=["barnarp"], help="which evaluation")
+    parser.add_argument("--out", type=Path, required=True, help="folder for report.json and report.html")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the flight")
+    parser.add_argument("--quick", action="store_true", help="only the flight over the east half")
+
+
+def run_eval(args: argparse.Namespace) -> int:
+    """`buildloc eval NAME`."""
+    from buildloc.supervisor import dds_environment
+
+    os.environ.update(dds_environment())
+    from buildloc_eval.barnarp import evaluate
+
+    print(evaluate(args.out, args.seed, args.quick))
+    return 0
+
+
+sim_command = ("make a bag from an orthophoto or a rendered world", add_sim_arguments, run_sim)
+demo_command = ("sample bag through the live nodes; fixes, errors, picture", add_demo_arguments, run_demo)
+eval_command = ("evaluations with reports", add_eval_arguments, run_eval)
