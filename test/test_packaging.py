@@ -95,13 +95,15 @@ def test_manifest_covers_the_imports(package: str) -> None:
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_entry_points_name_functions(package: str) -> None:
+def test_entry_points_exist(package: str) -> None:
     for group in setup_arguments(package).get("entry_points", {}).values():
         for entry in group:
-            module, function = entry.split("=")[1].strip().split(":")
+            module, name = entry.split("=")[1].strip().split(":")
             path = SRC / package / (module.replace(".", "/") + ".py")
             tree = ast.parse(path.read_text(encoding="utf-8"))
-            assert function in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}, entry
+            defined = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+            defined |= {ast.unparse(node.targets[0]) for node in tree.body if isinstance(node, ast.Assign)}
+            assert name in defined, entry
 
 
 @pytest.mark.parametrize("package", PACKAGES)
