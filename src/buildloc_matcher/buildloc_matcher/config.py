@@ -24,7 +24,7 @@ class MatcherConfig:
     min_votes: int = param(3, "fewest rotation-consistent votes of a candidate", 1, 10000)
     top_k: int = param(20, "candidates rescored by MNN-Jaccard", 1, 1000)
     polish_iterations: int = param(4, "alignment steps of a candidate before it is scored; 0: none", 0, 50)
-    mnn_distance_m: float = param(25.0, "largest distance of a mutual nearest-neighbour pair, m", 0.1, 1000.0)
+    mnn_distance_m: float = param(10.0, "largest distance of a mutual nearest-neighbour pair, m", 0.1, 1000.0)
     observable_margin_m: float = param(
         15.0, "margin around the hull of the map that was observed, m", 0.0, 1000.0
     )
