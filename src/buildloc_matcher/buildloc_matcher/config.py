@@ -37,6 +37,9 @@ class MatcherConfig:
     refine_iterations: int = param(6, "refinement steps while the distance shrinks", 1, 100)
     min_buildings: int = param(12, "fewest buildings in the map for a fix", 3, 100000)
     min_jaccard: float = param(0.35, "smallest MNN-Jaccard of an accepted candidate", 0.0, 1.0)
+    max_log10_false_alarm: float = param(
+        -3.0, "log10 of the chance matches expected in the whole reference", -300.0, 10.0
+    )
     min_lead: float = param(1.3, "smallest MNN-Jaccard ratio to the best candidate elsewhere", 1.0, 100.0)
     rival_distance_m: float = param(200.0, "candidates further away than this are elsewhere, m", 0.0, 1e6)
     min_pairs: int = param(10, "fewest distinct reference buildings matched for a fix", 3, 100000)

@@ -69,6 +69,12 @@ class ReferenceDatabase:
         low, high = self.centroids_m.min(axis=0), self.centroids_m.max(axis=0)
         return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
+    @property
+    def area_m2(self) -> float:
+        """Area of the bounds."""
+        west, south, east, north = self.bounds_m
+        return (east - west) * (north - south)
+
     @cached_property
     def _to_wgs84(self) -> Transformer:
         return Transformer.from_crs(CRS(self.epsg), CRS(WGS84), always_xy=True)

@@ -10,7 +10,7 @@ import numpy as np
 from buildloc_msgs_py.config import check
 from buildloc_msgs_py.types import Candidate, Fix, FrameObservation, Keyframe, LocalMap, NoFix
 
-from buildloc_matcher.acceptance import acceptance_score, lead, refuse_coarse, refuse_refined
+from buildloc_matcher.acceptance import acceptance_score, lead, log10_false_alarm, refuse_coarse, refuse_refined
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.database import DatabaseError, ReferenceDatabase, descriptor_hash
 from buildloc_matcher.descriptors import stars
@@ -83,6 +83,7 @@ class Matcher:
         if ranked:
             ratio = funnel["lead"] = lead(ranked[0], ranked[1:], config)
             first = acceptance_score(ranked[0].mnn_jaccard, ratio, config)
+            funnel["log10_false_alarm"] = log10_false_alarm(scores[0][1], database.area_m2, config)
             ranked[0] = replace(ranked[0], acceptance=first)
         funnel |= {
             "query_stars": len(query),
@@ -119,7 +120,8 @@ class Matcher:
             return f"map has {buildings:.0f} buildings, fewer than {self.config.min_buildings}"
         if not found.candidates:
             return "no candidate: no place in the reference gathers enough consistent votes"
-        return refuse_coarse(found.scores[0], found.funnel["lead"], self.config)
+        best, funnel = found.scores[0], found.funnel
+        return refuse_coarse(best, funnel["lead"], funnel["log10_false_alarm"], self.config)
 
     def fix(
         self, local_map: LocalMap, keyframes: Sequence[Keyframe], observations: Sequence[FrameObservation]

@@ -17,12 +17,15 @@ from buildloc_matcher.geometry import Similarity, fit_similarity
 
 @dataclass(frozen=True)
 class Score:
-    """A candidate's transform, its MNN-Jaccard, its mutual pairs (count) and their RMS distance in m."""
+    """A candidate's transform, its MNN-Jaccard, its mutual pairs (count) and their RMS distance in m, the
+    number of map buildings and the density of the reference around them."""
 
     transform: Similarity
     jaccard: float
     pairs: int
     rms_m: float
+    queries: int
+    density_per_m2: float
 
 
 def mutual_pairs(query_m: FloatArray, reference_m: FloatArray, max_distance_m: float) -> NDArray[np.int64]:
@@ -65,12 +68,13 @@ def mnn_jaccard(
 
 def nearby(
     tree: cKDTree, reference_m: FloatArray, transform: Similarity, query_m: FloatArray, margin_m: float
-) -> FloatArray:
-    """Reference buildings (N, 2) within reach of the map under the transform."""
+) -> tuple[FloatArray, float]:
+    """Reference buildings (N, 2) within reach of the map under the transform, and how many per m2."""
     moved = transform.apply(query_m)
     centre = moved.mean(axis=0)
     reach = float(np.linalg.norm(moved - centre, axis=1).max()) + margin_m
-    return reference_m[np.sort(np.asarray(tree.query_ball_point(centre, reach), dtype=np.int64))]
+    local = reference_m[np.sort(np.asarray(tree.query_ball_point(centre, reach), dtype=np.int64))]
+    return local, len(local) / (math.pi * reach**2)
 
 
 def score_candidate(
@@ -81,13 +85,14 @@ def score_candidate(
     The aligned transform is kept only where it scores at least as well as the voted one.
     """
     margin = 4.0 * config.mnn_distance_m + config.observable_margin_m
-    local = nearby(tree, reference_m, start, query_m, margin)
+    local, density = nearby(tree, reference_m, start, query_m, margin)
 
     def scored(transform: Similarity) -> Score:
         moved = transform.apply(query_m)
         jaccard, pairs = mnn_jaccard(moved, local, config)
         squared = np.sum((moved[pairs[:, 0]] - local[pairs[:, 1]]) ** 2, axis=1)
-        return Score(transform, jaccard, len(pairs), math.sqrt(squared.mean()) if len(pairs) else math.inf)
+        rms = math.sqrt(squared.mean()) if len(pairs) else math.inf
+        return Score(transform, jaccard, len(pairs), rms, len(query_m), density)
 
     best, transform = scored(start), start
     for distance in np.linspace(2.0, 1.0, config.polish_iterations) * config.mnn_distance_m:
