@@ -269,8 +269,9 @@ def _replay(args: argparse.Namespace) -> int:
         settings[node]["use_sim_time"] = True
     with tempfile.TemporaryDirectory(prefix="buildloc-") as folder:
         fixes = args.out or Path(folder) / "fixes.jsonl"
-        report = replay(args.bag, None if args.no_nodes else settings, args.rate, Path(folder), fixes)
+        played = replay(args.bag, None if args.no_nodes else settings, args.rate, Path(folder), fixes)
         results = read_fixes(fixes)
+    report = played.report
     accepted = [result for result in results if isinstance(result, Fix)]
     for result in accepted:
         print(describe(result))

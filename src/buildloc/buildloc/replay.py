@@ -12,18 +12,22 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import rclpy
-from buildloc_msgs_py import qos, topics
+from buildloc_msgs_py import qos, topics, wire
 from buildloc_msgs_py.errors import BuildlocError
+from buildloc_msgs_py.types import Keyframe, LocalMap
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from nav_msgs.msg import Path as PathMessage
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import PointCloud2
 
 from buildloc.bag import IMAGES, TELEMETRY, open_bag, raw_messages, require_topics
 from buildloc.settings import MAPPER, MATCHER, NODES, REFERENCE_DB, SEGMENTER, Settings
@@ -59,6 +63,15 @@ class ReplayReport:
         return self.images - self.frames - self.frames_unusable
 
 
+@dataclass(frozen=True)
+class Replay:
+    """What came of a replay: the figures, and the latest map with its keyframes (None, () without one)."""
+
+    report: ReplayReport
+    local_map: LocalMap | None
+    keyframes: tuple[Keyframe, ...]
+
+
 class ReplayNode(Node):  # type: ignore[misc]
     """Publishers for what the bag holds, and the nodes' latest diagnostics."""
 
@@ -69,6 +82,11 @@ class ReplayNode(Node):  # type: ignore[misc]
         self.messages: dict[str, str] = {}
         self._clock = self.create_publisher(Clock, "/clock", 10)
         self.outputs: dict[str, Any] = {}
+        self.latest: dict[str, Any] = {}
+        self.create_subscription(PointCloud2, topics.MAP, partial(self.latest.__setitem__, topics.MAP), qos.SENSOR)
+        self.create_subscription(
+            PathMessage, topics.KEYFRAMES, partial(self.latest.__setitem__, topics.KEYFRAMES), qos.SENSOR
+        )
         self.create_subscription(DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, qos.SENSOR)
 
     def _on_diagnostics(self, array: DiagnosticArray) -> None:
@@ -170,7 +188,7 @@ def _drain(node: ReplayNode, images: int, alive: Callable[[], None]) -> None:
             progress, since = now, time.monotonic()
 
 
-def replay(bag: Path, settings: Settings | None, rate: float, folder: Path, fixes: Path) -> ReplayReport:
+def replay(bag: Path, settings: Settings | None, rate: float, folder: Path, fixes: Path) -> Replay:
     """Play a bag into the node graph and record /buildloc/fix with a process of its own.
 
     ``settings`` None: the nodes are someone else's and run already. ``folder`` takes the parameter file,
@@ -212,7 +230,13 @@ def replay(bag: Path, settings: Settings | None, rate: float, folder: Path, fixe
             started = time.monotonic()
             images = _play(node, bag, rate, alive)
             _drain(node, images, alive)
-            return node.report(images, time.monotonic() - started)
+            report = node.report(images, time.monotonic() - started)
+            recorded_map, path = node.latest.get(topics.MAP), node.latest.get(topics.KEYFRAMES)
+            return Replay(
+                report,
+                None if recorded_map is None else wire.decode_map(recorded_map),
+                () if path is None else wire.decode_keyframes(path),
+            )
         finally:
             rclpy.try_shutdown(context=context)
             thread.join()
