@@ -101,7 +101,8 @@ class ReplayNode(Node):  # type: ignore[misc]
             cls = getattr(importlib.import_module(f"{package}.msg"), name)
         except (ImportError, AttributeError):
             return False
-        self.outputs[topic] = self.create_publisher(cls, topic, qos.SENSOR)
+        profile = qos.SENSOR if topic.lstrip("/") in IMAGES else qos.TELEMETRY
+        self.outputs[topic] = self.create_publisher(cls, topic, profile)
         return True
 
     def tick(self, time_ns: int) -> None:

@@ -49,8 +49,8 @@ class MatcherNode(Node):  # type: ignore[misc]
         self._pose = self.create_publisher(PoseWithCovarianceStamped, topics.POSE, qos.SENSOR)
         telemetry = self.session.telemetry.add
         for kind, topic, profile, handle in (
-            (CameraInfo, topics.CAMERA_INFO, qos.SENSOR, partial(telemetry, topics.CAMERA_INFO)),
-            (Range, topics.ALTITUDE, qos.SENSOR, partial(telemetry, topics.ALTITUDE)),
+            (CameraInfo, topics.CAMERA_INFO, qos.TELEMETRY, partial(telemetry, topics.CAMERA_INFO)),
+            (Range, topics.ALTITUDE, qos.TELEMETRY, partial(telemetry, topics.ALTITUDE)),
             (
                 QuaternionStamped,
                 topics.GIMBAL_ATTITUDE,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left, insort
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -16,6 +17,7 @@ T = TypeVar("T")
 Attitude = tuple[float, float, float, float]
 
 MAX_AGE_NS = 1_000_000_000
+PATIENCE_NS = 3_000_000_000
 HISTORY = 2_000
 
 
@@ -116,45 +118,49 @@ class FramePairing:
     """Turns messages in the order they come into frames, in the order of the images.
 
     An image waits until telemetry at or after its stamp is there, so that live and recorded flights pair
-    the same values; it goes out with what there is when the next image comes or at :meth:`flush`.
+    the same values however their topics interleave. It goes out with what there is once it is PATIENCE_NS
+    older than the newest image, or at :meth:`flush`.
     """
 
     def __init__(self) -> None:
         self.telemetry = Telemetry()
-        self._waiting: _Waiting | None = None
+        self._waiting: deque[_Waiting] = deque()
         self._last_stamp_ns = -1
 
     def add(self, topic: str, message: Any) -> list[Frame | FrameFault]:
         """Take a message of any input topic; the frames, or faults, that it completes."""
-        done: list[Frame | FrameFault] = []
         if topic in (topics.IMAGE, topics.IMAGE_COMPRESSED):
             stamp = wire.stamp_ns(message)
-            if stamp == self._last_stamp_ns:
-                return done  # the same picture, raw and compressed
-            done += self.flush()
-            decode = wire.decode_image if topic == topics.IMAGE else wire.decode_compressed_image
-            self._waiting = _Waiting(stamp, str(message.header.frame_id), lambda: decode(message))
-            self._last_stamp_ns = stamp
+            if stamp != self._last_stamp_ns:  # otherwise the same picture, raw and compressed
+                decode = wire.decode_image if topic == topics.IMAGE else wire.decode_compressed_image
+                self._waiting.append(_Waiting(stamp, str(message.header.frame_id), lambda: decode(message)))
+                self._last_stamp_ns = stamp
         else:
             self.telemetry.add(topic, message)
-        if self._waiting is not None and self.telemetry.settled(self._waiting.stamp_ns):
-            done += self.flush()
+        done: list[Frame | FrameFault] = []
+        while self._waiting and self._due(self._waiting[0].stamp_ns):
+            done.append(self._complete(self._waiting.popleft()))
         return done
 
+    def _due(self, stamp_ns: int) -> bool:
+        return self.telemetry.settled(stamp_ns) or abs(self._last_stamp_ns - stamp_ns) > PATIENCE_NS
+
     @property
-    def waiting_stamp_ns(self) -> int | None:
-        """Stamp of the image that waits for its telemetry."""
-        return None if self._waiting is None else self._waiting.stamp_ns
+    def waiting(self) -> int:
+        """Number of images that wait for their telemetry."""
+        return len(self._waiting)
 
     def flush(self) -> list[Frame | FrameFault]:
-        """The waiting image, if any, with the telemetry there is."""
-        waiting, self._waiting = self._waiting, None
-        if waiting is None:
-            return []
+        """The waiting images with the telemetry there is: nothing more will come."""
+        done = [self._complete(waiting) for waiting in self._waiting]
+        self._waiting.clear()
+        return done
+
+    def _complete(self, waiting: _Waiting) -> Frame | FrameFault:
         try:
             camera, altitude, attitude = self.telemetry.at(waiting.stamp_ns)
             frame = Frame(waiting.stamp_ns, waiting.frame_id, waiting.decode(), camera, altitude, attitude)
             validate_frame(frame)
         except BuildlocError as error:
-            return [FrameFault(waiting.stamp_ns, str(error))]
-        return [frame]
+            return FrameFault(waiting.stamp_ns, str(error))
+        return frame

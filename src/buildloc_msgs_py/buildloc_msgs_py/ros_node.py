@@ -108,26 +108,30 @@ class FrameAssembler:
         self.pairing = FramePairing()
         self._on_frame = on_frame
         self._diagnostics = diagnostics
-        self._settling: int | None = None
-        for kind, topic in (
-            (Image, topics.IMAGE),
-            (CompressedImage, topics.IMAGE_COMPRESSED),
-            (CameraInfo, topics.CAMERA_INFO),
-            (Range, topics.ALTITUDE),
-            (QuaternionStamped, topics.GIMBAL_ATTITUDE),
+        self._messages = self._messages_before = 0
+        for kind, topic, profile in (
+            (Image, topics.IMAGE, qos.SENSOR),
+            (CompressedImage, topics.IMAGE_COMPRESSED, qos.SENSOR),
+            (CameraInfo, topics.CAMERA_INFO, qos.TELEMETRY),
+            (Range, topics.ALTITUDE, qos.TELEMETRY),
+            (QuaternionStamped, topics.GIMBAL_ATTITUDE, qos.TELEMETRY),
         ):
-            node.create_subscription(kind, topic, self._handler(topic), qos.SENSOR)
+            node.create_subscription(kind, topic, self._handler(topic), profile)
         clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = node.create_timer(FLUSH_PERIOD_S, self._on_timer, clock=clock)
 
     def _handler(self, topic: str) -> Callable[[Any], None]:
-        return lambda message: self._deliver(self.pairing.add(topic, message))
+        def handle(message: Any) -> None:
+            self._messages += 1
+            self._deliver(self.pairing.add(topic, message))
+
+        return handle
 
     def _on_timer(self) -> None:
-        """Let an image go that has waited a whole period: its telemetry has stopped."""
-        if self._settling is not None and self._settling == self.pairing.waiting_stamp_ns:
+        """Let waiting images go after a whole period without any message: the telemetry has stopped."""
+        if self._messages == self._messages_before:
             self._deliver(self.pairing.flush())
-        self._settling = self.pairing.waiting_stamp_ns
+        self._messages_before = self._messages
 
     def _deliver(self, results: list[Frame | FrameFault]) -> None:
         for result in results:
