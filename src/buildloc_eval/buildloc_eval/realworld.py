@@ -65,8 +65,8 @@ def place_barnarp(data: Path, out: Path, radius_km: float = RADIUS_KM) -> Ground
     degrees = radius_km / 111.0
     lat, lon = LEXINGTON_DEG
     stretch = degrees / np.cos(np.radians(lat))
-    box = (lon - stretch, lat - degrees, lon + stretch, lat + degrees)
-    around = gpd.read_parquet(data / "footprints" / "boston_osm.parquet", bbox=box).geometry.to_crs(epsg)
+    boston = gpd.read_parquet(data / "footprints" / "boston_osm.parquet", columns=["geometry"]).geometry
+    around = boston.cx[lon - stretch : lon + stretch, lat - degrees : lat + degrees].to_crs(epsg)
     inside = shapely.distance(shapely.centroid(around.to_numpy()), shapely.Point(east, north)) <= radius_km * 1e3
     hole = shapely.box(left, top - height * gsd, left + width * gsd, top).buffer(HOLE_MARGIN_M)
     kept = around[inside & ~shapely.intersects(around.to_numpy(), hole)]

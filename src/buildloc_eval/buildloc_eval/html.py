@@ -1,0 +1,42 @@
+"""Self-contained HTML of a report: its figures as tables, its pictures embedded."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+STYLE = (
+    "body{font:15px sans-serif;max-width:70em;margin:2em auto;padding:0 1em}table{border-collapse:collapse}"
+    "td,th{border:1px solid #ccc;padding:.2em .6em;text-align:left;vertical-align:top}img{max-width:100%}"
+)
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, dict):
+        return _table(value)
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return html.escape("none" if value is None else str(value))
+
+
+def _table(values: dict[str, Any]) -> str:
+    rows = "".join(f"<tr><th>{html.escape(str(k))}</th><td>{_cell(v)}</td></tr>" for k, v in values.items())
+    return f"<table>{rows}</table>"
+
+
+def write_report(path: Path, title: str, report: dict[str, Any], pictures: Sequence[tuple[str, Path]]) -> None:
+    """Write one HTML file that needs no other."""
+    figures = "".join(
+        f"<h2>{html.escape(caption)}</h2>"
+        f'<img alt="{html.escape(caption)}" src="data:image/png;base64,'
+        f'{base64.b64encode(picture.read_bytes()).decode()}">'
+        for caption, picture in pictures
+    )
+    heading = html.escape(title)
+    path.write_text(
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{heading}</title>'
+        f"<style>{STYLE}</style><h1>{heading}</h1>{_table(report)}{figures}</html>\n"
+    )
