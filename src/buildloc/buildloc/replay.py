@@ -37,6 +37,7 @@ START_TIMEOUT_S = 90.0
 STALL_TIMEOUT_S = 60.0
 CLOCK_PERIOD_S = 0.05
 POLL_S = 0.02
+SETTLE_S = 0.5  # a subscription is seen here a moment before it can hear
 SUBSCRIBERS = {**dict.fromkeys(IMAGES, 2), **dict.fromkeys(TELEMETRY, 3)}
 
 
@@ -228,6 +229,7 @@ def replay(bag: Path, settings: Settings | None, rate: float, folder: Path, fixe
             ready = node.ready if supervisor is not None else node.connected
             if not _wait(ready, START_TIMEOUT_S, alive):
                 raise ReplayError("the nodes did not come up in time; see their output above")
+            time.sleep(SETTLE_S)
             started = time.monotonic()
             images = _play(node, bag, rate, alive)
             _drain(node, images, alive)

@@ -92,7 +92,9 @@ def fuse(views: Sequence[View], poses: Sequence[Similarity], config: MapperConfi
         size = (int(c1 - c0), int(r1 - r0))
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         window = np.s_[r0:r1, c0:c1]
-        whole = np.full_like(view.mask, 255)
-        seen[window] += np.asarray(cv2.warpPerspective(whole, homography, size, flags=flags)) > 254
+        footprint = np.zeros((int(r1 - r0), int(c1 - c0)), dtype=np.uint8)
+        outline = (quad - (left + c0 * gsd, top - r0 * gsd)) * [1.0, -1.0] / gsd - 0.5
+        cv2.fillConvexPoly(footprint, np.round(outline * 16).astype(np.int32), 1, cv2.LINE_8, 4)
+        seen[window] += footprint
         building[window] += np.asarray(cv2.warpPerspective(view.mask, homography, size, flags=flags)) > 127
     return FusedMap(left, top, gsd, seen, building)

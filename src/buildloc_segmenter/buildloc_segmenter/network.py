@@ -49,8 +49,8 @@ class Network:
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         if len(inputs) != 1 or len(inputs[0].shape) != 4 or inputs[0].type != "tensor(float)":
             raise NetworkError(f"{path}: needs exactly one float input of four axes; export it again")
-        channels = inputs[0].shape[1 if config.layout == "NCHW" else 3]
-        if isinstance(channels, int) and channels != 3:
+        channels, other = inputs[0].shape[1::2] if config.layout == "NCHW" else inputs[0].shape[3::-2]
+        if channels != 3 and (isinstance(channels, int) or other == 3):
             raise NetworkError(
                 f"{path}: input {inputs[0].shape} has not three channels in {config.layout}; "
                 "correct the parameter layout"

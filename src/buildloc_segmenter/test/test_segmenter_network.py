@@ -1,0 +1,204 @@
+"""The contract with ONNX networks, on graphs of a few nodes, and the network that is shipped."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import onnx
+import pytest
+from buildloc_msgs_py.config import ConfigError
+from buildloc_segmenter.config import SegmenterConfig
+from buildloc_segmenter.network import Network, NetworkError, remove_specks
+from onnx import TensorProto, helper, numpy_helper
+
+PLAIN = SegmenterConfig(network_gsd_m=0.0, input_multiple=8, min_component_m2=0.0)
+DATA = Path(os.environ.get("BUILDLOC_DATA", Path(__file__).parents[4] / "shared" / "data"))
+
+
+def save_graph(
+    path: Path,
+    weights: np.ndarray,
+    bias: list[float],
+    stride: int = 1,
+    tail: str | None = None,
+    nhwc: bool = False,
+) -> str:
+    """A network that weighs the three channels per class, at a stride, with Sigmoid or Softmax behind."""
+    kernel = np.zeros((len(bias), 3, stride, stride), dtype=np.float32)
+    kernel[:] = weights.reshape(len(bias), 3, 1, 1) / stride**2
+    initializers = [
+        numpy_helper.from_array(kernel, "kernel"),
+        numpy_helper.from_array(np.float32(bias), "bias"),
+    ]
+    nodes, last = [], "image"
+    if nhwc:
+        nodes.append(helper.make_node("Transpose", ["image"], ["planes"], perm=[0, 3, 1, 2]))
+        last = "planes"
+    nodes.append(helper.make_node("Conv", [last, "kernel", "bias"], ["scores"], strides=[stride, stride]))
+    last = "scores"
+    if tail is not None:
+        nodes.append(helper.make_node(tail, [last], ["tail"], **({"axis": 1} if tail == "Softmax" else {})))
+        last = "tail"
+    if nhwc:
+        nodes.append(helper.make_node("Transpose", [last], ["back"], perm=[0, 2, 3, 1]))
+        last = "back"
+    shape = ["n", "h", "w", 3] if nhwc else ["n", 3, "h", "w"]
+    graph = helper.make_graph(
+        nodes,
+        "tiny",
+        [helper.make_tensor_value_info("image", TensorProto.FLOAT, shape)],
+        [helper.make_tensor_value_info(last, TensorProto.FLOAT, None)],
+        initializers,
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    onnx.save(model, str(path))
+    return str(path)
+
+
+def scene() -> tuple[np.ndarray, np.ndarray]:
+    """A red building on green ground, BGR, sides that are no multiples of anything, and its mask."""
+    image = np.full((50, 70, 3), (40, 160, 40), dtype=np.uint8)
+    image[16:32, 24:48] = (40, 40, 200)
+    mask = np.zeros((50, 70), dtype=bool)
+    mask[16:32, 24:48] = True
+    return image, mask
+
+
+RED_MINUS_GREEN = np.array([0.1, -0.1, 0.0])
+
+
+def iou(found: np.ndarray, true: np.ndarray) -> float:
+    return float(((found > 0) & true).sum() / ((found > 0) | true).sum())
+
+
+@pytest.mark.parametrize("stride", [1, 2, 4])
+def test_one_class_of_logits_at_any_stride(tmp_path: Path, stride: int) -> None:
+    model = save_graph(tmp_path / "net.onnx", RED_MINUS_GREEN, [0.0], stride)
+    image, true = scene()
+    mask = Network(replace(PLAIN, model=model)).segment(image, 0.2)
+    assert mask.shape == (50, 70) and mask.dtype == np.uint8 and set(np.unique(mask)) == {0, 255}
+    assert iou(mask, true) > (0.99 if stride == 1 else 0.85)
+
+
+@pytest.mark.parametrize("building_class", [0, 1])
+def test_two_classes_of_logits(tmp_path: Path, building_class: int) -> None:
+    weights = np.array([RED_MINUS_GREEN, -RED_MINUS_GREEN])
+    model = save_graph(tmp_path / "net.onnx", weights if building_class == 0 else weights[::-1], [0.0, 0.0], 4)
+    image, true = scene()
+    config = replace(PLAIN, model=model, building_class=building_class)
+    assert iou(Network(config).segment(image, 0.2), true) > 0.85
+
+
+def test_two_classes_of_probability(tmp_path: Path) -> None:
+    weights = np.array([-RED_MINUS_GREEN, RED_MINUS_GREEN])
+    model = save_graph(tmp_path / "net.onnx", weights, [0.0, 0.0], 1, tail="Softmax")
+    image, true = scene()
+    assert iou(Network(replace(PLAIN, model=model, output="probability")).segment(image, 0.2), true) > 0.99
+
+
+def test_one_class_of_probability_and_the_threshold(tmp_path: Path) -> None:
+    model = save_graph(tmp_path / "net.onnx", np.zeros(3), [0.0], 1, tail="Sigmoid")
+    config = replace(PLAIN, model=model, output="probability")
+    image, _ = scene()
+    assert Network(replace(config, threshold=0.45)).segment(image, 0.2).min() == 255
+    assert Network(replace(config, threshold=0.55)).segment(image, 0.2).max() == 0
+
+
+def test_channels_last_input_and_output(tmp_path: Path) -> None:
+    model = save_graph(tmp_path / "net.onnx", RED_MINUS_GREEN, [0.0], 2, nhwc=True)
+    image, true = scene()
+    assert iou(Network(replace(PLAIN, model=model, layout="NHWC")).segment(image, 0.2), true) > 0.9
+    with pytest.raises(NetworkError, match="correct the parameter layout"):
+        Network(replace(PLAIN, model=model, layout="NCHW"))
+
+
+def test_channel_order_and_normalisation_reach_the_network(tmp_path: Path) -> None:
+    image, true = scene()
+    swapped = save_graph(tmp_path / "bgr.onnx", np.array([0.0, -0.1, 0.1]), [-1.0])
+    assert iou(Network(replace(PLAIN, model=swapped, channel_order="bgr")).segment(image, 0.2), true) > 0.99
+    assert Network(replace(PLAIN, model=swapped, channel_order="rgb")).segment(image, 0.2).max() == 0
+    # (200 - 100) / 50 = 2 on the building's red and (40 - 100) / 50 = -1.2 elsewhere.
+    red = save_graph(tmp_path / "red.onnx", np.array([1.0, 0.0, 0.0]), [0.0])
+    config = replace(PLAIN, model=red, mean=(100.0, 0.0, 0.0), std=(50.0, 1.0, 1.0))
+    probability = Network(config).probability(image, 0.2)
+    assert probability[20, 30] == pytest.approx(1 / (1 + np.exp(-2.0)), abs=1e-4)
+    assert probability[2, 2] == pytest.approx(1 / (1 + np.exp(1.2)), abs=1e-4)
+
+
+def test_images_are_resampled_to_the_gsd_of_the_training(tmp_path: Path) -> None:
+    # A strided network sees 4 px as one: at half the training's GSD that is 8 px of the image.
+    model = save_graph(tmp_path / "net.onnx", RED_MINUS_GREEN, [0.0], 4)
+    image, true = scene()
+    config = replace(PLAIN, model=model, network_gsd_m=0.2)
+    for gsd_m in (0.05, 0.1, 0.2, 0.4):
+        mask = Network(config).segment(image, gsd_m)
+        assert mask.shape == true.shape
+        assert iou(mask, true) > (0.85 if gsd_m >= 0.2 else 0.4)
+
+
+def test_an_absurd_altitude_is_refused(tmp_path: Path) -> None:
+    model = save_graph(tmp_path / "net.onnx", RED_MINUS_GREEN, [0.0])
+    with pytest.raises(NetworkError, match="check altitude"):
+        Network(replace(PLAIN, model=model, network_gsd_m=0.2)).segment(scene()[0], 100.0)
+
+
+def test_three_classes_are_refused(tmp_path: Path) -> None:
+    model = save_graph(tmp_path / "net.onnx", np.zeros((3, 3)), [0.0, 0.0, 0.0])
+    with pytest.raises(NetworkError, match="neither one nor two classes"):
+        Network(replace(PLAIN, model=model)).segment(scene()[0], 0.2)
+
+
+def test_a_missing_a_damaged_and_a_foreign_file(tmp_path: Path) -> None:
+    with pytest.raises(NetworkError, match="no such ONNX file"):
+        Network(replace(PLAIN, model=str(tmp_path / "absent.onnx")))
+    (tmp_path / "garbage.onnx").write_bytes(b"not a network")
+    with pytest.raises(NetworkError, match=r"garbage\.onnx: is not a loadable ONNX network") as caught:
+        Network(replace(PLAIN, model=str(tmp_path / "garbage.onnx")))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"providers": ("NoSuchProvider",)}, "NoSuchProvider not in this ONNX Runtime; it has"),
+        ({"layout": "CHWN"}, "parameter layout = CHWN is not one of NCHW, NHWC"),
+        ({"std": (1.0, 0.0, 1.0)}, "std = .* is not positive"),
+        ({"mean": (1.0,)}, "mean = .* does not have three values"),
+        ({"threshold": 1.5}, "threshold = 1.5 is out of range"),
+    ],
+)
+def test_a_wrong_parameter_is_named(change: dict[str, object], message: str) -> None:
+    with pytest.raises((NetworkError, ConfigError), match=message):
+        Network(replace(SegmenterConfig(), **change))  # type: ignore[arg-type]
+
+
+def test_specks_and_pinholes_are_removed() -> None:
+    mask = np.zeros((40, 40), dtype=np.uint8)
+    mask[5:25, 5:25] = 255
+    mask[10:12, 10:12] = 0
+    mask[30, 30] = 255
+    cleaned = remove_specks(mask, 9)
+    assert cleaned[10, 10] == 255 and cleaned[30, 30] == 0 and (cleaned > 0).sum() == 400
+
+
+def test_the_shipped_network_runs_and_calls_a_meadow_no_building() -> None:
+    rng = np.random.default_rng(0)
+    meadow = np.clip(rng.normal((60, 110, 80), 12, (200, 300, 3)), 0, 255).astype(np.uint8)
+    mask = Network(SegmenterConfig()).segment(cv2.GaussianBlur(meadow, (0, 0), 2), 0.15)
+    assert mask.shape == (200, 300) and (mask > 0).mean() < 0.1
+
+
+@pytest.mark.data
+def test_the_shipped_network_on_real_ground_it_never_saw() -> None:
+    folder = DATA / "imagery" / "barnarp"
+    if not folder.is_dir():
+        pytest.skip(f"no real imagery: {folder} is absent (set BUILDLOC_DATA)")
+    # 250 x 160 m in the middle of the orthophoto; the model card has 0.59 for all of it.
+    window = np.s_[2000:3000, 5000:6600]
+    image = cv2.imread(str(folder / "ortho.jpg"), cv2.IMREAD_COLOR)[window]
+    true = cv2.imread(str(folder / "labels.png"), cv2.IMREAD_GRAYSCALE)[window] > 127
+    assert iou(Network(SegmenterConfig()).segment(image, 0.16), true) > 0.45
