@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from buildloc_msgs_py.config import ConfigError, check, param
@@ -46,7 +47,9 @@ def check_segmenter(config: SegmenterConfig) -> None:
         if value not in choices:
             raise ConfigError(f"parameter {name} = {value} is not one of {', '.join(choices)}")
     for name, values in (("mean", config.mean), ("std", config.std)):
-        if len(values) != 3:
-            raise ConfigError(f"parameter {name} = {list(values)} does not have three values, one per channel")
+        if len(values) != 3 or not all(isinstance(v, (int, float)) and math.isfinite(v) for v in values):
+            raise ConfigError(f"parameter {name} = {list(values)} is not three numbers, one per channel")
     if not all(value > 0.0 for value in config.std):
         raise ConfigError(f"parameter std = {list(config.std)} is not positive")
+    if not config.providers:
+        raise ConfigError("parameter providers is empty; name one, such as CPUExecutionProvider")

@@ -11,22 +11,37 @@ from buildloc_segmenter.network import Network
 
 
 class Segmenter:
-    """Selects keyframes and segments them."""
+    """Selects keyframes and segments them.
+
+    ``select`` is cheap and belongs to one thread; ``segment`` keeps no state and may run on another.
+    """
 
     def __init__(self, config: SegmenterConfig) -> None:
         self._network = Network(config)
         self._config = config
         self._last: Moment | None = None
 
-    def process(self, frame: Frame) -> Mask | None:
-        """The building mask of a keyframe, in the size of its image; None when it is no keyframe.
+    def select(self, frame: Frame) -> bool:
+        """Whether the frame is the next keyframe; later frames are then measured from it.
 
         Raises WireError for a frame whose telemetry or size cannot be used.
         """
         validate_frame(frame)
         now = Moment(frame.stamp_ns, heading_rad(frame.attitude_xyzw))
         if not is_keyframe(self._last, now, self._config):
-            return None
-        pixels = self._network.segment(frame.image_bgr, frame.altitude_m / frame.camera.fx)
+            return False
         self._last = now
+        return True
+
+    def segment(self, frame: Frame) -> Mask:
+        """The building mask of a frame, in the size of its image. Raises NetworkError."""
+        pixels = self._network.segment(frame.image_bgr, frame.altitude_m / frame.camera.fx)
         return Mask(frame.stamp_ns, frame.frame_id, pixels)
+
+    def process(self, frame: Frame) -> Mask | None:
+        """The building mask of a keyframe; None when the frame is none. Raises WireError or NetworkError."""
+        return self.segment(frame) if self.select(frame) else None
+
+    def reset(self) -> None:
+        """Forget the flight: the next frame is a keyframe."""
+        self._last = None

@@ -1,21 +1,34 @@
-"""Images with telemetry in; /buildloc/mask out."""
+"""Images with telemetry in; /buildloc/mask out.
+
+Inference runs on one worker thread, so that a slow network never keeps images from being received.
+Keyframes that it cannot keep up with are dropped, counted and reported.
+"""
 
 from __future__ import annotations
 
 import sys
-import time
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from time import perf_counter
 from typing import Any
 
 from buildloc_msgs_py import encode, qos, topics
 from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.ros_node import Diagnostics, FrameAssembler, declare_config, run_node
-from buildloc_msgs_py.types import Frame
+from buildloc_msgs_py.types import Frame, Mask
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 from sensor_msgs.msg import Image
 
 from buildloc_segmenter.config import SegmenterConfig
 from buildloc_segmenter.segmenter import Segmenter
+
+KEYFRAMES_WAITING = 8
+FINE = (DiagnosticStatus.OK, "segmenting")
+TOO_SLOW = (
+    DiagnosticStatus.WARN,
+    "a keyframe was dropped, inference is slower than they come; use a faster network or provider",
+)
 
 
 class SegmenterNode(Node):  # type: ignore[misc]
@@ -25,23 +38,62 @@ class SegmenterNode(Node):  # type: ignore[misc]
         super().__init__("segmenter_node", **kwargs)
         self._segmenter = Segmenter(declare_config(self, SegmenterConfig))
         self._diagnostics = Diagnostics(self)
-        self._keyframes = 0
+        self._worker = ThreadPoolExecutor(1, "segment")
+        self._jobs: deque[Future[tuple[Mask, float]]] = deque()
+        self._keyframes = self._dropped = self._failed = 0
+        self._inference_ms = 0.0
+        self._state = FINE
         self._masks = self.create_publisher(Image, topics.MASK, qos.SENSOR)
+        self._finished = self.create_guard_condition(self._on_finished)
         self._assembler = FrameAssembler(self, self._on_frame, self._diagnostics)
 
     def _on_frame(self, frame: Frame) -> None:
-        started = time.perf_counter()
-        try:
-            mask = self._segmenter.process(frame)
-        except BuildlocError as error:
-            self._diagnostics.report(DiagnosticStatus.WARN, str(error), frames=self._assembler.frames)
-            return
-        figures: dict[str, object] = {"frames": self._assembler.frames}
-        if mask is not None:
-            self._keyframes += 1
-            figures |= {"keyframes": self._keyframes, "seconds": time.perf_counter() - started}
-            self._masks.publish(encode.encode_mask(mask))
-        self._diagnostics.report(DiagnosticStatus.OK, "segmenting", **figures)
+        if self._segmenter.select(frame):
+            if len(self._jobs) < KEYFRAMES_WAITING:
+                self._submit(frame)
+            else:
+                self._dropped += 1
+                self._state = TOO_SLOW
+        self._report()
+
+    def _submit(self, frame: Frame) -> None:
+        self._keyframes += 1  # before its mask is there: whoever counts masks knows that one is to come
+        job = self._worker.submit(self._segment, frame)
+        self._jobs.append(job)
+        job.add_done_callback(lambda _: self._finished.trigger())
+
+    def _segment(self, frame: Frame) -> tuple[Mask, float]:
+        """On the worker: the mask and its milliseconds."""
+        started = perf_counter()
+        return self._segmenter.segment(frame), 1e3 * (perf_counter() - started)
+
+    def _on_finished(self) -> None:
+        while self._jobs and self._jobs[0].done():
+            job = self._jobs.popleft()
+            error = job.exception()
+            if error is None:
+                mask, self._inference_ms = job.result()
+                self._masks.publish(encode.encode_mask(mask))
+                self._state = FINE
+            else:
+                self._keyframes -= 1
+                self._failed += 1
+                name = "" if isinstance(error, BuildlocError) else f"{type(error).__name__}: "
+                self._state = (DiagnosticStatus.ERROR, f"segmentation failed: {name}{error}")
+        self._report()
+
+    def _report(self) -> None:
+        level, message = self._state
+        self._diagnostics.report(
+            level, message, frames=self._assembler.frames, keyframes=self._keyframes,
+            keyframes_waiting=len(self._jobs), keyframes_dropped=self._dropped,
+            keyframes_failed=self._failed, inference_ms=self._inference_ms,
+        )  # fmt: skip
+
+    def destroy_node(self) -> None:
+        """Finish the inference that runs, give up the waiting ones."""
+        self._worker.shutdown(wait=True, cancel_futures=True)
+        super().destroy_node()
 
 
 def main() -> int:

@@ -63,3 +63,11 @@ def test_a_bad_frame_is_refused_and_leaves_the_policy_alone() -> None:
     with pytest.raises(WireError, match="camera_info says 97x64"):
         segmenter.process(replace(frame(0.0), camera=CameraModel(97, 64, 100.0, 100.0, 48.0, 31.5)))
     assert segmenter.process(frame(1.0)) is not None
+
+
+def test_reset_forgets_the_flight() -> None:
+    segmenter = Segmenter(CONFIG)
+    assert segmenter.select(frame(0.0))
+    assert not segmenter.select(frame(1.0))
+    segmenter.reset()
+    assert segmenter.select(frame(2.0))

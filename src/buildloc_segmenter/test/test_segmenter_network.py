@@ -26,6 +26,7 @@ def save_graph(
     stride: int = 1,
     tail: str | None = None,
     nhwc: bool = False,
+    size: int | None = None,
 ) -> str:
     """A network that weighs the three channels per class, at a stride, with Sigmoid or Softmax behind."""
     kernel = np.zeros((len(bias), 3, stride, stride), dtype=np.float32)
@@ -46,7 +47,8 @@ def save_graph(
     if nhwc:
         nodes.append(helper.make_node("Transpose", [last], ["back"], perm=[0, 2, 3, 1]))
         last = "back"
-    shape = ["n", "h", "w", 3] if nhwc else ["n", 3, "h", "w"]
+    sides = ["h", "w"] if size is None else [size, size]
+    shape = ["n", *sides, 3] if nhwc else ["n", 3, *sides]
     graph = helper.make_graph(
         nodes,
         "tiny",
@@ -87,7 +89,8 @@ def test_one_class_of_logits_at_any_stride(tmp_path: Path, stride: int) -> None:
 @pytest.mark.parametrize("building_class", [0, 1])
 def test_two_classes_of_logits(tmp_path: Path, building_class: int) -> None:
     weights = np.array([RED_MINUS_GREEN, -RED_MINUS_GREEN])
-    model = save_graph(tmp_path / "net.onnx", weights if building_class == 0 else weights[::-1], [0.0, 0.0], 4)
+    ordered = weights if building_class == 0 else weights[::-1]
+    model = save_graph(tmp_path / "net.onnx", ordered, [0.0, 0.0], 4)
     image, true = scene()
     config = replace(PLAIN, model=model, building_class=building_class)
     assert iou(Network(config).segment(image, 0.2), true) > 0.85
@@ -149,7 +152,45 @@ def test_an_absurd_altitude_is_refused(tmp_path: Path) -> None:
 def test_three_classes_are_refused(tmp_path: Path) -> None:
     model = save_graph(tmp_path / "net.onnx", np.zeros((3, 3)), [0.0, 0.0, 0.0])
     with pytest.raises(NetworkError, match="neither one nor two classes"):
-        Network(replace(PLAIN, model=model)).segment(scene()[0], 0.2)
+        Network(replace(PLAIN, model=model))
+
+
+def test_probability_is_not_taken_for_logits_nor_the_reverse(tmp_path: Path) -> None:
+    sigmoid = save_graph(tmp_path / "sigmoid.onnx", RED_MINUS_GREEN, [0.0], tail="Sigmoid")
+    with pytest.raises(NetworkError, match="set the parameter output to probability"):
+        Network(replace(PLAIN, model=sigmoid))
+    with pytest.raises(NetworkError, match="set the parameter output to logits"):
+        Network(SegmenterConfig(output="probability"))
+
+
+def test_what_fails_in_the_network_is_one_line(tmp_path: Path) -> None:
+    # The shipped network needs multiples of 32.
+    with pytest.raises(NetworkError, match="does not run on 272x272 pixels") as caught:
+        Network(SegmenterConfig(input_multiple=16))
+    assert "\n" not in str(caught.value)
+    model = save_graph(tmp_path / "nan.onnx", np.full(3, np.nan), [0.0])
+    with pytest.raises(NetworkError, match="not finite"):
+        Network(replace(PLAIN, model=model))
+
+
+@pytest.mark.parametrize("side", [32, 64])
+def test_a_network_of_fixed_size_goes_over_the_image_in_tiles(tmp_path: Path, side: int) -> None:
+    free = save_graph(tmp_path / "free.onnx", RED_MINUS_GREEN, [0.0])
+    fixed = save_graph(tmp_path / "fixed.onnx", RED_MINUS_GREEN, [0.0], size=side)
+    image, true = scene()  # 50 rows, 70 columns: smaller and larger than a tile
+    mask = Network(replace(PLAIN, model=fixed)).segment(image, 0.2)
+    assert iou(mask, true) > 0.99
+    assert (mask == Network(replace(PLAIN, model=free)).segment(image, 0.2)).all()
+
+
+def test_a_large_image_goes_in_tiles_and_none_is_left_out(tmp_path: Path) -> None:
+    model = save_graph(tmp_path / "net.onnx", RED_MINUS_GREEN, [0.0])
+    image = np.full((700, 1900, 3), (40, 160, 40), dtype=np.uint8)
+    true = np.zeros((700, 1900), dtype=bool)
+    for corner in ((0, 0), (680, 1880), (340, 940), (340, 1010), (0, 1880)):
+        at = np.s_[corner[0] : corner[0] + 20, corner[1] : corner[1] + 20]
+        image[at], true[at] = (40, 40, 200), True
+    assert ((Network(replace(PLAIN, model=model)).segment(image, 0.2) > 0) == true).all()
 
 
 def test_a_missing_a_damaged_and_a_foreign_file(tmp_path: Path) -> None:
@@ -167,7 +208,10 @@ def test_a_missing_a_damaged_and_a_foreign_file(tmp_path: Path) -> None:
         ({"providers": ("NoSuchProvider",)}, "NoSuchProvider not in this ONNX Runtime; it has"),
         ({"layout": "CHWN"}, "parameter layout = CHWN is not one of NCHW, NHWC"),
         ({"std": (1.0, 0.0, 1.0)}, "std = .* is not positive"),
-        ({"mean": (1.0,)}, "mean = .* does not have three values"),
+        ({"mean": (1.0,)}, "mean = .* is not three numbers"),
+        ({"mean": ("a", "b", "c")}, "mean = .* is not three numbers"),
+        ({"std": (1.0, float("nan"), 1.0)}, "std = .* is not three numbers"),
+        ({"providers": ()}, "providers is empty"),
         ({"threshold": 1.5}, "threshold = 1.5 is out of range"),
     ],
 )
@@ -183,6 +227,16 @@ def test_specks_and_pinholes_are_removed() -> None:
     mask[30, 30] = 255
     cleaned = remove_specks(mask, 9)
     assert cleaned[10, 10] == 255 and cleaned[30, 30] == 0 and (cleaned > 0).sum() == 400
+
+
+def test_only_enclosed_background_is_a_hole() -> None:
+    # Close to the ground the whole picture is smaller than the smallest building: it stays empty.
+    assert remove_specks(np.zeros((40, 60), dtype=np.uint8), 1e6).max() == 0
+    mask = np.full((40, 60), 255, dtype=np.uint8)
+    mask[:3, :3] = 0  # a corner of ground
+    mask[20:23, 20:23] = 0
+    cleaned = remove_specks(mask, 50)
+    assert cleaned[0, 0] == 0 and cleaned[21, 21] == 255
 
 
 def test_the_shipped_network_runs_and_calls_a_meadow_no_building() -> None:
@@ -202,3 +256,16 @@ def test_the_shipped_network_on_real_ground_it_never_saw() -> None:
     image = cv2.imread(str(folder / "ortho.jpg"), cv2.IMREAD_COLOR)[window]
     true = cv2.imread(str(folder / "labels.png"), cv2.IMREAD_GRAYSCALE)[window] > 127
     assert iou(Network(SegmenterConfig()).segment(image, 0.16), true) > 0.45
+
+
+@pytest.mark.data
+def test_a_network_that_ends_in_a_sigmoid_on_real_ground() -> None:
+    model = DATA / "models" / "baseline_west.onnx"
+    if not model.is_file():
+        pytest.skip(f"no such network: {model} is absent (set BUILDLOC_DATA)")
+    folder = DATA / "imagery" / "barnarp"
+    window = np.s_[2000:3000, 5000:6600]  # in the east half, which it never saw
+    image = cv2.imread(str(folder / "ortho.jpg"), cv2.IMREAD_COLOR)[window]
+    true = cv2.imread(str(folder / "labels.png"), cv2.IMREAD_GRAYSCALE)[window] > 127
+    mask = Network(SegmenterConfig(model=str(model), output="probability")).segment(image, 0.16)
+    assert iou(mask, true) > 0.7
