@@ -111,6 +111,25 @@ def test_one_class_of_probability_and_the_threshold(tmp_path: Path) -> None:
     assert Network(replace(config, threshold=0.55)).segment(image, 0.2).max() == 0
 
 
+def test_a_label_map_is_a_probability(tmp_path: Path) -> None:
+    model = onnx.load(save_graph(tmp_path / "net.onnx", RED_MINUS_GREEN, [0.0]))
+    del model.graph.output[:]
+    model.graph.initializer.append(numpy_helper.from_array(np.array([1]), "class_axis"))
+    model.graph.node.extend(
+        [
+            helper.make_node("Relu", ["scores"], ["positive"]),
+            helper.make_node("Sign", ["positive"], ["sign"]),
+            helper.make_node("Cast", ["sign"], ["whole"], to=TensorProto.INT64),
+            helper.make_node("Squeeze", ["whole", "class_axis"], ["labels"]),
+        ]
+    )
+    model.graph.output.append(helper.make_tensor_value_info("labels", TensorProto.INT64, None))
+    onnx.save(model, str(tmp_path / "labels.onnx"))
+    config = replace(PLAIN, model=str(tmp_path / "labels.onnx"), output="probability")
+    image, true = scene()
+    assert iou(Network(config).segment(image, 0.2), true) > 0.99
+
+
 def test_channels_last_input_and_output(tmp_path: Path) -> None:
     model = save_graph(tmp_path / "net.onnx", RED_MINUS_GREEN, [0.0], 2, nhwc=True)
     image, true = scene()
