@@ -64,7 +64,10 @@ def cases(data: Path) -> tuple[Case, Case]:
     """The two flights of the evaluation."""
     baseline = (f"{SEGMENTER}.model={data / BASELINE}", f"{SEGMENTER}.output=probability")
     return (
-        Case("east_baseline", "east half, baseline network (trained on the west half)", EAST_HALF, FLIGHT, baseline),
+        Case(
+            "east_baseline", "east half, baseline network (trained on the west half)", EAST_HALF, FLIGHT,
+            baseline,
+        ),
         Case("all_shipped", "whole orthophoto, shipped network (never saw Barnarp)", 0.0, WIDE, ()),
     )  # fmt: skip
 
@@ -121,7 +124,8 @@ def offline_scores(
     true_m = _true_buildings(labels, update, placed, config.min_area_m2)
     to_true = np.linalg.norm(map_m[:, None] - true_m[None], axis=2)
     matched = Matcher(database, config).locate(update.local_map)
-    centre = placed.apply(update.local_map.centroids_m[update.local_map.areas_m2 >= config.min_area_m2]).mean(axis=0)
+    large = update.local_map.areas_m2 >= config.min_area_m2
+    centre = placed.apply(update.local_map.centroids_m[large]).mean(axis=0)
     ranks = [
         rank
         for rank, c in enumerate(matched.candidates, start=1)
@@ -157,9 +161,7 @@ def _true_buildings(
     _, _, stats, centroids = cv2.connectedComponentsWithStats(mask, connectivity=8)
     large = stats[1:, cv2.CC_STAT_AREA] * window.gsd_m**2 >= min_area_m2
     pixels = centroids[1:][large]
-    metres = np.column_stack(
-        [window.left_m + (pixels[:, 0] + 0.5) * window.gsd_m, window.top_m - (pixels[:, 1] + 0.5) * window.gsd_m]
-    )
+    metres = np.array([window.left_m, window.top_m]) + (pixels + 0.5) * [window.gsd_m, -window.gsd_m]
     seen = np.vstack([update.local_map.centroids_m, [(k.x_m, k.y_m) for k in update.keyframes]])
     hull = cv2.convexHull(placed.apply(seen).astype(np.float32))
     inside = [cv2.pointPolygonTest(hull, (float(x), float(y)), False) >= 0 for x, y in metres]
@@ -167,7 +169,13 @@ def _true_buildings(
 
 
 def run_case(
-    case: Case, ground: Ground, data: Path, database: ReferenceDatabase, database_path: Path, out: Path, seed: int
+    case: Case,
+    ground: Ground,
+    data: Path,
+    database: ReferenceDatabase,
+    database_path: Path,
+    out: Path,
+    seed: int,
 ) -> tuple[dict[str, Any], LiveFlight]:
     """Bag, live nodes, offline scores of one flight."""
     folder = out / case.name

@@ -10,7 +10,7 @@ from buildloc_msgs_py.ground import camera_matrix, level_matrix, pixels_to_level
 from buildloc_msgs_py.types import ByteArray, CameraModel, FloatArray
 
 from buildloc_eval.flight import FlightConfig, focal_px
-from buildloc_eval.world import World
+from buildloc_eval.world import World, WorldError
 
 Quaternion = tuple[float, float, float, float]
 
@@ -48,17 +48,28 @@ def photograph(
     config: FlightConfig,
     rng: np.random.Generator,
 ) -> ByteArray:
-    """(H, W, 3) BGR from ``pose`` (x, y, altitude in metres, ENU yaw of image-right)."""
+    """(H, W, 3) BGR from ``pose`` (x, y, altitude in metres, ENU yaw of image-right).
+
+    Raises WorldError when the image would reach beyond the bounds of the world.
+    """
     x, y, altitude, yaw = pose
     placed = level_to_world(x, y, yaw)
-    corners_uv = np.array([[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]]) - 0.5
+    wide, high = camera.width, camera.height
+    corners_uv = np.array([[0, 0], [wide, 0], [wide, high], [0, high]]) - 0.5
     corners = pixels_to_level(corners_uv, camera, altitude, attitude_xyzw) @ placed[:2, :2].T + placed[:2, 2]
-    low, high = corners.min(axis=0) - 1.0, corners.max(axis=0) + 1.0
-    window = world.window((float(low[0]), float(low[1]), float(high[0]), float(high[1])))
+    (west, south), (east, north) = corners.min(axis=0), corners.max(axis=0)
+    bounds = world.bounds_m
+    if west < bounds[0] or south < bounds[1] or east > bounds[2] or north > bounds[3]:
+        raise WorldError("the camera sees beyond the edge of the world; fly lower or choose a smaller region")
+    window = world.window((float(west) - 1.0, float(south) - 1.0, float(east) + 1.0, float(north) + 1.0))
     gsd = window.gsd_m
     # Metres relative to the window keep the homography well conditioned.
     to_window = np.array(
-        [[1 / gsd, 0, (x - window.left_m) / gsd - 0.5], [0, -1 / gsd, (window.top_m - y) / gsd - 0.5], [0, 0, 1.0]]
+        [
+            [1 / gsd, 0, (x - window.left_m) / gsd - 0.5],
+            [0, -1 / gsd, (window.top_m - y) / gsd - 0.5],
+            [0, 0, 1.0],
+        ]
     )
     rays = camera_matrix(camera) @ level_matrix(attitude_xyzw).T @ np.diag([1.0, -1.0, altitude])
     homography = to_window @ level_to_world(0.0, 0.0, yaw) @ np.linalg.inv(rays)
@@ -70,4 +81,4 @@ def photograph(
     gain = max(0.2, 1.0 + config.exposure * rng.normal())
     grainy = image.astype(np.float32) * np.float32(gain)
     grainy += rng.standard_normal(image.shape, dtype=np.float32) * np.float32(config.noise)
-    return np.clip(grainy, 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(grainy, 0, 255), dtype=np.uint8)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 import os
 import sys
 from pathlib import Path
@@ -14,7 +15,7 @@ from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.types import Fix
 
 from buildloc_eval.flight import FlightConfig, fly
-from buildloc_eval.sim import write_flight
+from buildloc_eval.sim import SimError, remove_bag, write_flight
 from buildloc_eval.town import write_town
 from buildloc_eval.world import OrthoWorld, TownWorld, World
 
@@ -32,6 +33,16 @@ def _region(text: str) -> tuple[float, float, float, float]:
     return west, south, east, north
 
 
+def _extent(text: str) -> float:
+    try:
+        extent = float(text)
+    except ValueError:
+        extent = math.nan
+    if not 300.0 <= extent <= 20_000.0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a length of 300 to 20000 m")
+    return extent
+
+
 def _progress(done: int, total: int) -> None:
     if sys.stderr.isatty():
         print(f"\r{done}/{total} images", end="\n" if done == total else "", file=sys.stderr, flush=True)
@@ -44,9 +55,14 @@ def add_sim_arguments(parser: argparse.ArgumentParser) -> None:
     world.add_argument("--ortho", type=Path, help="orthophoto to cut the flight out of (with --georef)")
     world.add_argument("--world", type=Path, help="GeoJSON of footprints to render the flight over")
     world.add_argument("--town", type=Path, help="invent a suburb, write its footprints here and render it")
-    parser.add_argument("--georef", type=Path, help="JSON with origin_lat_deg, origin_lon_deg (top left), gsd_m")
-    parser.add_argument("--extent-m", type=float, default=3200.0, help="side of the invented suburb, m")
-    parser.add_argument("--region", type=_region, default=(0.0, 0.0, 1.0, 1.0), help="W,S,E,N fractions to fly in")
+    parser.add_argument("--force", action="store_true", help="replace the bag of an earlier run")
+    parser.add_argument(
+        "--georef", type=Path, help="JSON with origin_lat_deg, origin_lon_deg (top left), gsd_m"
+    )
+    parser.add_argument("--extent-m", type=_extent, default=3200.0, help="side of the invented suburb, m")
+    parser.add_argument(
+        "--region", type=_region, default=(0.0, 0.0, 1.0, 1.0), help="W,S,E,N fractions to fly in"
+    )
     parser.add_argument("--seed", type=int, default=1, help="seed of everything random")
     for field in dataclasses.fields(FlightConfig):
         low, high = field.metadata["low"], field.metadata["high"]
@@ -62,14 +78,17 @@ def _world(args: argparse.Namespace) -> World:
             raise BuildlocError("--ortho needs --georef; give the JSON that places the orthophoto")
         return OrthoWorld(args.ortho, args.georef)
     if args.town is not None:
+        print(f"inventing a suburb of {args.extent_m:g} m: {args.town}", file=sys.stderr)
         write_town(args.town, args.seed, args.extent_m, TOWN_CENTRE_DEG)
     return TownWorld(args.town or args.world, args.seed)
 
 
 def run_sim(args: argparse.Namespace) -> int:
-    """`buildloc sim`."""
+    """`buildloc sim`; raises BuildlocError for what cannot be flown or written."""
     names = [field.name for field in dataclasses.fields(FlightConfig)]
     config = from_mapping(FlightConfig, {name: getattr(args, name) for name in names})
+    if args.out.exists() and not args.force:
+        raise SimError(f"{args.out}: exists; choose another --out or give --force")
     world = _world(args)
     west, south, east, north = world.bounds_m
     w, s, e, n = args.region
@@ -77,7 +96,9 @@ def run_sim(args: argparse.Namespace) -> int:
         west + w * (east - west), south + s * (north - south),
         west + e * (east - west), south + n * (north - south),
     )  # fmt: skip
-    images = write_flight(args.out, world, fly(box, config, args.seed), config, args.seed, _progress)
+    trajectory = fly(box, config, args.seed)
+    remove_bag(args.out)
+    images = write_flight(args.out, world, trajectory, config, args.seed, _progress)
     size = sum(file.stat().st_size for file in args.out.iterdir()) / 1e6
     print(f"{args.out}: {images} images, {size:.1f} MB, EPSG:{world.epsg}, seed {args.seed}")
     return 0
@@ -108,7 +129,8 @@ def run_demo(args: argparse.Namespace) -> int:
     print(f"reference: {len(built)} buildings of {args.footprints} -> {database}")
     settings = load()
     settings[REFERENCE_DB]["database"] = str(database.resolve())
-    print(f"replaying {args.bag} at {args.rate:g}x through the nodes (rendered imagery, not real)", flush=True)
+    rate = f"{args.rate:g}x"
+    print(f"replaying {args.bag} at {rate} through the nodes (rendered imagery, not real)", flush=True)
     live = evaluate_live(args.bag, built, settings, args.rate, args.out, f"{args.bag} (rendered imagery)")
     print(live.table)
     print(live.summary)

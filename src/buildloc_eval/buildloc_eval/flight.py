@@ -11,6 +11,8 @@ from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.types import FloatArray
 
 Box = tuple[float, float, float, float]
+HORIZON_RAD = math.radians(80.0)
+MIN_STATES = 10
 START_NS = 1_760_000_000 * 10**9
 
 
@@ -65,9 +67,17 @@ def focal_px(config: FlightConfig) -> float:
 
 
 def margin_m(config: FlightConfig) -> float:
-    """How far from the camera an image may reach: half its diagonal at the largest height, and tilt."""
+    """How far from the camera an image may reach: half its diagonal at the largest height, and tilt.
+
+    Raises FlightError when it would come near the horizon.
+    """
     half_diagonal = math.hypot(config.width, config.height) / 2.0
     angle = math.atan(half_diagonal / focal_px(config)) + math.radians(3.0 * config.tilt_deg)
+    if angle > HORIZON_RAD:
+        raise FlightError(
+            f"with hfov_deg = {config.hfov_deg:g} and tilt_deg = {config.tilt_deg:g} images come near the "
+            "horizon; narrow the field of view or tilt less"
+        )
     return (config.altitude_m + config.altitude_swing_m) * math.tan(angle)
 
 
@@ -103,20 +113,35 @@ def legs(box_m: Box, config: FlightConfig) -> FloatArray:
 
 
 def fly(box_m: Box, config: FlightConfig, seed: int) -> Trajectory:
-    """The flight at ten states per second, reproducible by its seed."""
+    """The flight at ten states per second, reproducible by its seed.
+
+    Raises FlightError when it does not fit the box, touches the ground or is too short to be one.
+    """
+    if config.altitude_swing_m >= config.altitude_m:
+        raise FlightError(
+            f"altitude_swing_m = {config.altitude_swing_m:g} reaches the ground from altitude_m = "
+            f"{config.altitude_m:g}; fly higher or swing less"
+        )
     rng = np.random.default_rng(seed)
     corners = legs(box_m, config)
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(corners, axis=0).T))])
     length = min(config.length_m, float(along[-1]))
     seconds = np.arange(0.0, length / config.speed_mps, 0.1)
+    if len(seconds) < MIN_STATES:
+        raise FlightError(
+            f"{length:g} m at {config.speed_mps:g} m/s last less than {MIN_STATES / 10:g} s; "
+            "fly further or more slowly"
+        )
     xy = np.column_stack([np.interp(seconds * config.speed_mps, along, c) for c in corners.T])
     xy = _smooth(xy, 60)
     course = np.unwrap(np.arctan2(*np.gradient(xy, axis=0).T[::-1]))
     # Image-up looks along the course, so image-right lies 90 degrees to the right of it.
     yaw = _smooth(course[:, None], 30)[:, 0] - math.pi / 2.0 + math.radians(4.0) * _wave(seconds, 37.0, rng)
     altitude = config.altitude_m + config.altitude_swing_m * _wave(seconds, 61.0, rng)
-    tilt = math.radians(config.tilt_deg) * math.sqrt(2.0) * np.column_stack(
-        [_wave(seconds, 7.3, rng), _wave(seconds, 11.9, rng)]
+    tilt = (
+        math.radians(config.tilt_deg)
+        * math.sqrt(2.0)
+        * np.column_stack([_wave(seconds, 7.3, rng), _wave(seconds, 11.9, rng)])
     )
     stamps = START_NS + np.round(seconds * 1e9).astype(np.int64)
     return Trajectory(stamps, xy, altitude, yaw, tilt)

@@ -48,7 +48,10 @@ def placed_map(played: Replay, fix: Fix, epsg: int) -> FloatArray:
 def evaluate_live(
     bag: Path, database: ReferenceDatabase, settings: Settings, rate: float, out: Path, title: str
 ) -> LiveFlight:
-    """Replay a bag of `buildloc sim` into the nodes and score what arrived. Raises ReplayError, TruthError."""
+    """Replay a bag of `buildloc sim` into the nodes and score what arrived.
+
+    Raises ReplayError, TruthError.
+    """
     truth = read_truth(bag)
     for node in NODES:
         settings[node]["use_sim_time"] = True
@@ -68,7 +71,8 @@ def evaluate_live(
     last = "none" if scored.last_error_m is None else f"{scored.last_error_m:.2f}"
     summary = (
         f"{len(scored.fixes)} fixes received on /buildloc/fix; error in m: median {median}, last {last}, "
-        f"largest {max(scored.errors_m, default=math.nan):.2f}; {report.images} images, {report.dropped} dropped, "
+        f"largest {max(scored.errors_m, default=math.nan):.2f}; "
+        f"{report.images} images, {report.dropped} dropped, "
         f"{report.keyframes} keyframes, {report.maps} maps, {report.seconds:.0f} s"
     )
     return LiveFlight(tuple(results), scored, report, fix_table(scored, truth), summary, drawn)

@@ -27,7 +27,9 @@ def _table(values: dict[str, Any]) -> str:
     return f"<table>{rows}</table>"
 
 
-def write_report(path: Path, title: str, report: dict[str, Any], pictures: Sequence[tuple[str, Path]]) -> None:
+def write_report(
+    path: Path, title: str, report: dict[str, Any], pictures: Sequence[tuple[str, Path]]
+) -> None:
     """Write one HTML file that needs no other."""
     figures = "".join(
         f"<h2>{html.escape(caption)}</h2>"

@@ -36,7 +36,9 @@ def data_folder() -> Path:
     """The folder of the real data. Raises DataError when it is absent."""
     folder = Path(os.environ.get(DATA_VARIABLE, "../shared/data"))
     if not (folder / "footprints").is_dir():
-        raise DataError(f"{folder}: no data here; set {DATA_VARIABLE} to the folder with footprints/ and imagery/")
+        raise DataError(
+            f"{folder}: no data here; set {DATA_VARIABLE} to the folder with footprints/ and imagery/"
+        )
     return folder
 
 
@@ -67,7 +69,8 @@ def place_barnarp(data: Path, out: Path, radius_km: float = RADIUS_KM) -> Ground
     stretch = degrees / np.cos(np.radians(lat))
     boston = gpd.read_parquet(data / "footprints" / "boston_osm.parquet", columns=["geometry"]).geometry
     around = boston.cx[lon - stretch : lon + stretch, lat - degrees : lat + degrees].to_crs(epsg)
-    inside = shapely.distance(shapely.centroid(around.to_numpy()), shapely.Point(east, north)) <= radius_km * 1e3
+    centre = shapely.Point(east, north)
+    inside = shapely.distance(shapely.centroid(around.to_numpy()), centre) <= radius_km * 1e3
     hole = shapely.box(left, top - height * gsd, left + width * gsd, top).buffer(HOLE_MARGIN_M)
     kept = around[inside & ~shapely.intersects(around.to_numpy(), hole)]
     out.mkdir(parents=True, exist_ok=True)

@@ -86,7 +86,8 @@ def picture(
     if len(matched_m):
         close.scatter(*(matched_m - origin).T, s=14, c="tab:green", label="matched in the reference")
     truths = {stamp: to_database.transform(p.x_m, p.y_m) for stamp, p in truth.poses.items()}
-    lines = [(np.array(truths[f.stamp_ns]) - origin, p - origin) for f, p in zip(scored.fixes, fixes, strict=True)]
+    pairs = zip(scored.fixes, fixes, strict=True)
+    lines = [(np.array(truths[f.stamp_ns]) - origin, place - origin) for f, place in pairs]
     close.add_collection(LineCollection(lines, colors="tab:red", lw=0.8))
     low, high = (flown - origin).min(axis=0) - VIEW_MARGIN_M, (flown - origin).max(axis=0) + VIEW_MARGIN_M
     close.set_xlim(low[0], high[0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -59,11 +60,35 @@ def write_flight(
     """Photograph the world along the trajectory; returns the number of images.
 
     Telemetry comes at 10 Hz with noise. The heading that the gimbal reports is turned by a constant that
-    the seed draws: nothing may rely on a compass. Raises SimError when the bag exists, WorldError when the
-    flight leaves the world.
+    the seed draws: nothing may rely on a compass. A bag that could not be finished is removed.
+    Raises SimError when the bag exists, WorldError when the flight leaves the world.
     """
     if path.exists():
-        raise SimError(f"{path}: exists; choose another --out or remove it")
+        raise SimError(f"{path}: exists; choose another --out or give --force")
+    try:
+        return _write(path, world, trajectory, config, seed, progress)
+    except BaseException:
+        shutil.rmtree(path, ignore_errors=True)
+        raise
+
+
+def remove_bag(path: Path) -> None:
+    """Remove a bag of an earlier run, if any. Raises SimError for anything that is not a bag folder."""
+    if not path.exists():
+        return
+    if path.is_symlink() or not (path / "metadata.yaml").is_file():
+        raise SimError(f"{path}: exists and is not a bag; choose another --out")
+    shutil.rmtree(path)
+
+
+def _write(
+    path: Path,
+    world: World,
+    trajectory: Trajectory,
+    config: FlightConfig,
+    seed: int,
+    progress: Callable[[int, int], None],
+) -> int:
     rng = np.random.default_rng([seed, 1])
     camera = camera_model(config)
     turned = rng.uniform(-math.pi, math.pi)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,18 +20,35 @@ DISTRICT_M = 420.0
 GAP_M = 2.5
 
 
-def _house(rng: np.random.Generator) -> Polygon:
-    """An outline about the origin: rectangle, L, T or a large hall."""
+@dataclass(frozen=True)
+class _House:
+    """A plan in metres: a rectangle, perhaps with a wing (its left edge, width and depth)."""
+
+    width: float
+    height: float
+    wing: tuple[float, float, float] | None
+    quarter_turns: int
+
+    def outline(self) -> Polygon:
+        """Rectangle, L or T about the origin."""
+        w, h = self.width, self.height
+        body = shapely.box(-w / 2, -h / 2, w / 2, h / 2)
+        if self.wing is not None:
+            left, wide, deep = self.wing
+            body = body.union(shapely.box(left, h / 2 - 0.5, left + wide, h / 2 + deep))
+        return affinity.rotate(body, 90.0 * self.quarter_turns, origin=(0, 0))
+
+
+def _house(rng: np.random.Generator) -> _House:
+    """One house of the suburb; one in 25 is a large hall."""
     if rng.random() < 0.04:
-        w, h = rng.uniform(22, 48), rng.uniform(14, 26)
-        return shapely.box(-w / 2, -h / 2, w / 2, h / 2)
-    w, h = rng.uniform(9, 18), rng.uniform(7, 11)
-    body = shapely.box(-w / 2, -h / 2, w / 2, h / 2)
+        return _House(rng.uniform(22, 48), rng.uniform(14, 26), None, 0)
+    width, height = rng.uniform(9, 18), rng.uniform(7, 11)
+    wing = None
     if rng.random() < 0.45:
-        wing, depth = rng.uniform(4, 7), rng.uniform(3, 7)
-        left = rng.uniform(-w / 2, w / 2 - wing)
-        body = body.union(shapely.box(left, h / 2 - 0.5, left + wing, h / 2 + depth))
-    return affinity.rotate(body, 90.0 * rng.integers(4), origin=(0, 0))
+        wide, deep = rng.uniform(4, 7), rng.uniform(3, 7)
+        wing = rng.uniform(-width / 2, width / 2 - wide), wide, deep
+    return _House(width, height, wing, int(rng.integers(4)))
 
 
 def suburb(seed: int, extent_m: float) -> list[Polygon]:
@@ -48,15 +66,16 @@ def suburb(seed: int, extent_m: float) -> list[Polygon]:
             for j in range(-reach, reach + 1):
                 for side in (-1.0, 1.0):
                     bend = 12.0 * math.sin(i * lot / 90.0 + index)
-                    u, v = i * lot + rng.normal(0, 2.2), j * street + side * street * 0.24 + bend + rng.normal(0, 1.8)
+                    u = i * lot + rng.normal(0, 2.2)
+                    v = j * street + side * street * 0.24 + bend + rng.normal(0, 1.8)
                     place = centre + np.array([c * u - s * v, s * u + c * v])
                     skip = rng.random() < 0.14
                     turn = math.degrees(angle) + rng.normal(0, 5.0)
-                    shape = _house(rng)
+                    plan = _house(rng)
                     nearest = np.argmin(np.hypot(*(centres - place).T))
                     if skip or nearest != index or np.abs(place).max() > extent_m / 2:
                         continue
-                    house = affinity.rotate(shape, turn, origin=(0, 0))
+                    house = affinity.rotate(plan.outline(), turn, origin=(0, 0))
                     taken.append(affinity.translate(house, *place))
     return _apart(taken)
 
@@ -78,7 +97,7 @@ def write_town(path: Path, seed: int, extent_m: float, centre_deg: tuple[float, 
     to_wgs84 = Transformer.from_crs(epsg, 4326, always_xy=True)
     features = []
     for outline in suburb(seed, extent_m):
-        metres: FloatArray = shapely.get_coordinates(outline) + (east, north)
+        metres: FloatArray = shapely.get_coordinates(outline) + np.array([east, north])
         longitude, latitude = to_wgs84.transform(metres[:, 0], metres[:, 1])
         ring = [[round(float(x), 7), round(float(y), 7)] for x, y in zip(longitude, latitude, strict=True)]
         geometry = {"type": "Polygon", "coordinates": [ring]}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from buildloc.bag import open_bag, raw_messages
 from buildloc_msgs_py import topics
@@ -51,11 +52,13 @@ def read_truth(bag: Path) -> Truth:
     frame_id = ""
     with open_bag(bag) as reader:
         for connection, _, data in raw_messages(reader, bag, {topics.GROUND_TRUTH.lstrip("/")}):
-            message = reader.deserialize(data, connection.msgtype)
+            message: Any = reader.deserialize(data, connection.msgtype)
             position, q = message.pose.position, message.pose.orientation
             yaw = 2.0 * math.atan2(q.z, q.w)
             poses[stamp_ns(message)] = TruePose(position.x, position.y, position.z, yaw)
             frame_id = message.header.frame_id
     if not poses or not frame_id.startswith("utm:"):
-        raise TruthError(f"{bag}: has no {topics.GROUND_TRUTH}; errors are known for `buildloc sim` bags only")
+        raise TruthError(
+            f"{bag}: has no {topics.GROUND_TRUTH}; errors are known for `buildloc sim` bags only"
+        )
     return Truth(int(frame_id.removeprefix("utm:")), poses)

@@ -1,4 +1,7 @@
-"""Worlds seen from above: an orthophoto, or a rendered town over footprints. Metres are UTM east and north."""
+"""Worlds seen from above: an orthophoto, or a rendered town over footprints.
+
+Metres are UTM east and north.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +17,14 @@ import shapely
 from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.types import ByteArray, FloatArray
 from numpy.typing import NDArray
-from pyproj import CRS, Transformer
+from pyproj import Transformer
 
 Box = tuple[float, float, float, float]  # west, south, east, north, m
 RENDERED_GSD_M = 0.15
 GRASS, SOIL = np.array([62.0, 96.0, 84.0]), np.array([96.0, 120.0, 134.0])  # BGR
-ROOFS = np.array([[70, 86, 150], [92, 104, 160], [118, 120, 126], [86, 84, 90], [150, 152, 160], [84, 96, 124]])
+ROOFS = np.array(
+    [[70, 86, 150], [92, 104, 160], [118, 120, 126], [86, 84, 90], [150, 152, 160], [84, 96, 124]]
+)
 
 
 class WorldError(BuildlocError):
@@ -94,13 +99,17 @@ class OrthoWorld:
         """The pixels that touch the box."""
         west, south, east, north = box_m
         height, width = self._image.shape[:2]
-        c0, c1 = np.clip(np.array([west - self._left_m, east - self._left_m]) / self._gsd_m + [0, 1], 0, width)
-        r0, r1 = np.clip(np.array([self._top_m - north, self._top_m - south]) / self._gsd_m + [0, 1], 0, height)
-        c0, c1, r0, r1 = int(c0), int(c1), int(r0), int(r1)
+        c0, c1 = _pixels(west - self._left_m, east - self._left_m, self._gsd_m, width)
+        r0, r1 = _pixels(self._top_m - north, self._top_m - south, self._gsd_m, height)
         if c1 <= c0 or r1 <= r0:
             raise WorldError("the flight leaves the orthophoto; shorten it or choose another region")
         left, top = self._left_m + c0 * self._gsd_m, self._top_m - r0 * self._gsd_m
         return Window(self._image[r0:r1, c0:c1], left, top, self._gsd_m)
+
+
+def _pixels(low_m: float, high_m: float, gsd_m: float, count: int) -> tuple[int, int]:
+    """First pixel that an interval touches and the one after the last, within 0 and ``count``."""
+    return max(0, int(low_m / gsd_m)), min(count, max(0, int(high_m / gsd_m + 1.0)))
 
 
 class TownWorld:
@@ -117,6 +126,8 @@ class TownWorld:
         self.epsg = utm_epsg((south + north) / 2.0, (west + east) / 2.0)
         parts = shapely.get_parts(outlines.to_crs(self.epsg).to_numpy())
         self._polygons = parts[shapely.get_type_id(parts) == shapely.GeometryType.POLYGON]
+        if len(self._polygons) == 0:
+            raise WorldError(f"{footprints}: has no polygons; give a GeoJSON of building outlines")
         self._tree = shapely.STRtree(self._polygons)
         self._seed = seed
         self.bounds_m: Box = tuple(float(v) for v in shapely.total_bounds(self._polygons))  # type: ignore[assignment]
@@ -150,8 +161,9 @@ class TownWorld:
         crown = np.zeros_like(shade)
         for (east, north), radius in zip(self._trees_xy[inside], self._trees_r[inside], strict=True):
             centre = np.array([east, -north]) / gsd - shift
-            cv2.circle(shade, _fixed(centre + radius / gsd * 0.7), int(16 * radius / gsd), 255, -1, cv2.LINE_AA, 4)
-            cv2.circle(crown, _fixed(centre), int(16 * radius / gsd), 255, -1, cv2.LINE_AA, 4)
+            size = int(16 * radius / gsd)
+            cv2.circle(shade, _fixed(centre + radius / gsd * 0.7), size, 255, -1, cv2.LINE_AA, 4)
+            cv2.circle(crown, _fixed(centre), size, 255, -1, cv2.LINE_AA, 4)
         image *= 1.0 - 0.45 * (shade[:, :, None] / 255.0)
         leaves = np.array([38.0, 70.0, 52.0]) + 16.0 * fine[:, :, None]
         alpha = crown[:, :, None] / 255.0
