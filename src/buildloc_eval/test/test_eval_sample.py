@@ -76,5 +76,5 @@ def test_the_shipped_network_finds_the_rendered_roofs(truth: Truth, outlines: gp
         true = _true_mask(frame, truth, outlines) > 0
         both += int((found & true).sum())
         either += int((found | true).sum())
-    # 0.84 over the flight when this was written; a network below 0.6 would need another demonstration.
+    # 0.84 over every twelfth image when this was written; below 0.6 the demo would suffer.
     assert both / either > 0.6
