@@ -36,8 +36,13 @@ def with_plain_convolutions(module: nn.Module) -> nn.Module:
         if isinstance(child, nn.Conv2d):
             k, stride = child.kernel_size[0], child.stride[0]
             plain = nn.Conv2d(
-                child.in_channels, child.out_channels, k, stride, k // 2,
-                groups=child.groups, bias=child.bias is not None,
+                child.in_channels,
+                child.out_channels,
+                k,
+                stride,
+                k // 2,
+                groups=child.groups,
+                bias=child.bias is not None,
             )
             plain.load_state_dict(child.state_dict())
             setattr(module, name, plain)
@@ -50,7 +55,8 @@ def convolution(inputs: int, outputs: int, kernel: int) -> nn.Sequential:
     """Convolution, batch norm, ReLU."""
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, kernel, padding=kernel // 2, bias=False),
-        nn.BatchNorm2d(outputs), nn.ReLU(inplace=True),
+        nn.BatchNorm2d(outputs),
+        nn.ReLU(inplace=True),
     )
 
 
@@ -93,9 +99,7 @@ class BuildingNet(nn.Module):
         for merge in self.merge:
             x = functional.interpolate(x, scale_factor=2.0, mode="nearest")
             x = merge(torch.cat([x, taps.pop()], dim=1))
-        return functional.interpolate(
-            self.head(x), scale_factor=4.0, mode="bilinear", align_corners=False
-        )
+        return functional.interpolate(self.head(x), scale_factor=4.0, mode="bilinear", align_corners=False)
 
 
 def segmentation_loss(logits: Tensor, label: Tensor, weight: Tensor) -> Tensor:
@@ -111,8 +115,8 @@ def train(net: BuildingNet, mosaics: list[Mosaic], minutes: float, batch: int, s
     """Train for `minutes` of wall clock; return the number of steps."""
     sampler = CropSampler(mosaics, seed)
     optimiser = torch.optim.AdamW(
-        [{"params": net.encoder_parameters(), "lr": 3e-4},
-         {"params": net.decoder_parameters(), "lr": 1e-3}], weight_decay=1e-2,
+        [{"params": net.encoder_parameters(), "lr": 3e-4}, {"params": net.decoder_parameters(), "lr": 1e-3}],
+        weight_decay=1e-2,
     )
     peaks = [float(g["lr"]) for g in optimiser.param_groups]
     start, step, mean_loss = time.monotonic(), 0, float("nan")
@@ -142,9 +146,14 @@ def export(net: BuildingNet, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     free = {0: "n", 2: "h", 3: "w"}
     torch.onnx.export(
-        net, (torch.zeros(1, 3, 256, 256),), str(path), input_names=["rgb"],
-        output_names=["logits"], dynamic_axes={"rgb": free, "logits": free},
-        opset_version=17, dynamo=False,
+        net,
+        (torch.zeros(1, 3, 256, 256),),
+        str(path),
+        input_names=["rgb"],
+        output_names=["logits"],
+        dynamic_axes={"rgb": free, "logits": free},
+        opset_version=17,
+        dynamo=False,
     )
 
 
@@ -170,15 +179,19 @@ def predict(session: onnxruntime.InferenceSession, rgb: Image, valid: Image) -> 
 def confusion(found: NDArray[np.bool_], label: Image, valid: Image) -> NDArray[np.int64]:
     """Pixel counts: true positives, false positives, false negatives."""
     truth, seen = label > 127, valid > 0
-    return np.array([(found & truth & seen).sum(), (found & ~truth & seen).sum(),
-                     (~found & truth & seen).sum()], np.int64)
+    return np.array(
+        [(found & truth & seen).sum(), (found & ~truth & seen).sum(), (~found & truth & seen).sum()], np.int64
+    )
 
 
 def scores(counts: NDArray[np.int64]) -> dict[str, float]:
     """IoU, precision and recall of pixel counts."""
     tp, fp, fn = (int(c) for c in counts)
-    return {"iou": round(tp / max(1, tp + fp + fn), 4), "precision": round(tp / max(1, tp + fp), 4),
-            "recall": round(tp / max(1, tp + fn), 4)}
+    return {
+        "iou": round(tp / max(1, tp + fp + fn), 4),
+        "precision": round(tp / max(1, tp + fp), 4),
+        "recall": round(tp / max(1, tp + fn), 4),
+    }
 
 
 def evaluate(path: Path, held: list[Mosaic], imagery: Path) -> dict[str, dict[str, float]]:

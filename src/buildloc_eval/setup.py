@@ -20,6 +20,8 @@ setup(
     ],
     install_requires=[
         "buildloc_msgs_py",
+        "buildloc_segmenter",
+        "buildloc_mapper",
         "buildloc_matcher",
         "buildloc",
         "numpy>=1.26,<3",

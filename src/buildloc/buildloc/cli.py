@@ -178,8 +178,9 @@ def _locate(args: argparse.Namespace) -> int:
             {
                 "latitude_deg": latitude, "longitude_deg": longitude,
                 "easting_m": candidate.x_m, "northing_m": candidate.y_m,
-                "yaw_deg": math.degrees(candidate.yaw_rad), "scale": candidate.scale, "votes": candidate.votes,
-                "mnn_jaccard": candidate.mnn_jaccard, "acceptance": candidate.acceptance,
+                "yaw_deg": math.degrees(candidate.yaw_rad), "scale": candidate.scale,
+                "votes": candidate.votes, "mnn_jaccard": candidate.mnn_jaccard,
+                "acceptance": candidate.acceptance,
             }
         )  # fmt: skip
     fix = ranked[0] if refused is None else None

@@ -84,7 +84,9 @@ class ReplayNode(Node):  # type: ignore[misc]
         self._clock = self.create_publisher(Clock, "/clock", 10)
         self.outputs: dict[str, Any] = {}
         self.latest: dict[str, Any] = {}
-        self.create_subscription(PointCloud2, topics.MAP, partial(self.latest.__setitem__, topics.MAP), qos.SENSOR)
+        self.create_subscription(
+            PointCloud2, topics.MAP, partial(self.latest.__setitem__, topics.MAP), qos.SENSOR
+        )
         self.create_subscription(
             PathMessage, topics.KEYFRAMES, partial(self.latest.__setitem__, topics.KEYFRAMES), qos.SENSOR
         )

@@ -54,9 +54,7 @@ def log10_false_alarm(score: Score, area_m2: float, config: MatcherConfig) -> fl
     return tail + math.log10(trials)
 
 
-def refuse_coarse(
-    score: Score, lead_ratio: float, false_alarm: float, config: MatcherConfig
-) -> str | None:
+def refuse_coarse(score: Score, lead_ratio: float, false_alarm: float, config: MatcherConfig) -> str | None:
     """Why the best candidate is not convincing, or None; ``false_alarm`` is its log10."""
     if score.jaccard < config.min_jaccard:
         return f"best candidate has MNN-Jaccard {score.jaccard:.2f}, below {config.min_jaccard:g}"

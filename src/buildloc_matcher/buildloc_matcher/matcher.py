@@ -10,7 +10,13 @@ import numpy as np
 from buildloc_msgs_py.config import check
 from buildloc_msgs_py.types import Candidate, Fix, FrameObservation, Keyframe, LocalMap, NoFix
 
-from buildloc_matcher.acceptance import acceptance_score, lead, log10_false_alarm, refuse_coarse, refuse_refined
+from buildloc_matcher.acceptance import (
+    acceptance_score,
+    lead,
+    log10_false_alarm,
+    refuse_coarse,
+    refuse_refined,
+)
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.database import DatabaseError, ReferenceDatabase, descriptor_hash
 from buildloc_matcher.descriptors import stars
