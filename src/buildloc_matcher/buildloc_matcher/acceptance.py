@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 
 from buildloc_msgs_py.types import Candidate
-from scipy.stats import binom
 
 from buildloc_matcher.config import MatcherConfig
+from buildloc_matcher.evidence import GATE_SIGMAS
 from buildloc_matcher.geometry import wrap
 from buildloc_matcher.refinement import Refined
 from buildloc_matcher.selection import Score
@@ -33,37 +33,26 @@ def lead(best: Candidate, others: Sequence[Candidate], config: MatcherConfig) ->
     return best.mnn_jaccard / strongest if strongest > 0.0 else math.inf
 
 
-def acceptance_score(jaccard: float, lead_ratio: float, config: MatcherConfig) -> float:
-    """Evidence over threshold, the weaker of the two: 1 or more passes both."""
-    by_jaccard = jaccard / config.min_jaccard if config.min_jaccard > 0.0 else math.inf
-    return min(by_jaccard, lead_ratio / config.min_lead)
+def log_odds(evidence: float, area_m2: float, config: MatcherConfig) -> float:
+    """Evidence of a candidate less the logarithm of the number of poses the reference has room for.
 
-
-def log10_false_alarm(score: Score, area_m2: float, config: MatcherConfig) -> float:
-    """log10 of how many poses of the whole reference would match this well by chance.
-
-    A building dropped at random has a reference building within the MNN distance d with probability
-    p = 1 - exp(-density pi d^2); the tail of the binomial over the map's buildings is the chance of one
-    pose, and area / (pi d^2) positions times 36 rotations are tried. Buildings along streets are less
-    random than that, hence a limit well below 0 (``max_log10_false_alarm``).
+    A pose fills a disc as wide as the gate of a match, and a turn of 10 degrees. Nats: above 0 the map
+    lies here more likely than such evidence comes up by chance somewhere.
     """
-    disc_m2 = math.pi * config.mnn_distance_m**2
-    chance = -math.expm1(-score.density_per_m2 * disc_m2)
-    trials = max(1.0, area_m2 / disc_m2) * ROTATIONS
-    tail = float(binom.logsf(score.pairs - 1, score.queries, chance)) / math.log(10.0)
-    return tail + math.log10(trials)
+    disc_m2 = math.pi * (GATE_SIGMAS * config.sigma_m) ** 2
+    return evidence - math.log(max(1.0, area_m2 / disc_m2) * ROTATIONS)
 
 
-def refuse_coarse(score: Score, lead_ratio: float, false_alarm: float, config: MatcherConfig) -> str | None:
-    """Why the best candidate is not convincing, or None; ``false_alarm`` is its log10."""
+def refuse_coarse(score: Score, lead_ratio: float, odds: float, config: MatcherConfig) -> str | None:
+    """Why the best candidate is not convincing, or None; ``odds`` are its log-odds."""
+    if odds < config.min_log_odds:
+        return f"best candidate could be chance: log-odds {odds:.1f}, below {config.min_log_odds:g}"
     if score.jaccard < config.min_jaccard:
         return f"best candidate has MNN-Jaccard {score.jaccard:.2f}, below {config.min_jaccard:g}"
     if lead_ratio < config.min_lead:
         return f"best candidate leads another pose only {lead_ratio:.2f} times, below {config.min_lead:g}"
-    if score.pairs < config.min_pairs:
-        return f"best candidate matches {score.pairs} buildings, fewer than {config.min_pairs}"
-    if false_alarm > config.max_log10_false_alarm:
-        return f"best candidate could be chance: 1e{false_alarm:+.1f} such poses expected in the reference"
+    if len(score.pairs) < config.min_pairs:
+        return f"best candidate matches {len(score.pairs)} buildings, fewer than {config.min_pairs}"
     if score.rms_m > config.max_residual_m:
         return f"best candidate has residuals of {score.rms_m:.1f} m, above {config.max_residual_m:g} m"
     return None

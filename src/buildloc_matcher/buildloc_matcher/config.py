@@ -1,29 +1,52 @@
-"""Every parameter of the matcher, with its unit, default and range."""
+"""Every parameter of the matcher, with its unit, default and range; and its presets."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
 
-from buildloc_msgs_py.config import param
+from buildloc_msgs_py.config import ConfigError, from_mapping, param
+
+VOTES = ("score", "evidence")
+SELECTIONS = ("rigid", "grow")
 
 
 @dataclass(frozen=True)
 class MatcherConfig:
-    """Parameters of descriptor matching, voting, selection, refinement and acceptance."""
+    """Parameters of descriptor matching, voting, selection, refinement and acceptance.
+
+    The defaults are the preset ``default``; :data:`PRESETS` has the paper's.
+    """
 
     min_area_m2: float = param(20.0, "smallest footprint used, reference and query alike, m2", 0.0, 1e5)
-    tau_angle_deg: float = param(15.0, "tolerance on the L1 distance of the sorted angles, deg", 0.1, 180.0)
-    tau_perimeter: float = param(0.3, "tolerance on the relative perimeter difference", 0.01, 0.95)
-    tau_shape: float = param(0.3, "tolerance on the mean shape difference", 0.01, 1.0)
-    matches_per_star: int = param(50, "best reference matches kept per query star", 1, 10000)
+    tau_angle_deg: float = param(25.0, "filter: L1 distance of the sorted angles (Eq. 1), deg", 0.1, 180.0)
+    tau_perimeter: float = param(0.2, "filter: relative perimeter difference (Eq. 1)", 0.01, 0.95)
+    tau_shape: float = param(0.3, "filter: mean shape difference (Eq. 1)", 0.01, 1.0)
+    score_angle_deg: float = param(40.0, "score: angle distance that counts as none in common, deg", 0.1, 180.0)
+    score_perimeter: float = param(
+        0.3, "score: relative perimeter difference that counts as none in common; 1 in Eq. 2", 0.01, 5.0
+    )
+    score_area: float = param(0.45, "score: relative area difference that counts as none in common", 0.01, 5.0)
+    area_weight: float = param(3.0, "weight of the areas in the score; angles weigh 2, Eq. 2 has 0", 0.0, 10.0)
+    centre_weight: float = param(3.0, "weight of the central triangle; its neighbours weigh 1", 0.1, 10.0)
+    matches_per_star: int = param(100, "best reference matches kept per query star", 1, 10000)
+    second_look: int = param(
+        4, "thinned triangulations tried when the first look convinces nobody; 0: none", 0, 32
+    )
     scale_gate: float = param(0.15, "largest deviation of the map-to-world scale from 1", 0.0, 0.9)
+    sigma_m: float = param(2.0, "error of a map building against its neighbours, per axis, m", 0.1, 50.0)
+    match_share: float = param(0.7, "share of the map's buildings that the reference has", 0.05, 0.99)
+    votes: str = param("evidence", "what a hypothesis votes with: score (Eq. 3) or evidence of its surroundings")
     bin_size_m: float = param(100.0, "side of a voting bin, m", 1.0, 10000.0)
     rotation_tolerance_deg: float = param(
         10.0, "half width of a rotation-consistent cluster, deg", 0.1, 180.0
     )
-    min_votes: int = param(3, "fewest rotation-consistent votes of a candidate", 1, 10000)
-    top_k: int = param(20, "candidates rescored by MNN-Jaccard", 1, 1000)
-    polish_iterations: int = param(4, "alignment steps of a candidate before it is scored; 0: none", 0, 50)
+    min_votes: int = param(1, "fewest rotation-consistent votes of a candidate", 1, 10000)
+    top_k: int = param(64, "candidates rescored", 1, 10000)
+    selection: str = param(
+        "grow", "candidates are scored as rigid (Eq. 4) or grow from their best seed and follow the map's bend"
+    )
     mnn_distance_m: float = param(10.0, "largest distance of a mutual nearest-neighbour pair, m", 0.1, 1000.0)
     observable_margin_m: float = param(
         15.0, "margin around the hull of the map that was observed, m", 0.0, 1000.0
@@ -32,13 +55,13 @@ class MatcherConfig:
         60.0, "ground around each map building that was observed, m", 1.0, 10000.0
     )
     refine_frames: int = param(20, "most recent keyframes used by the refinement", 1, 10000)
-    refine_distance_m: float = param(50.0, "1-NN distance of the first refinement step, m", 0.1, 1000.0)
-    refine_last_distance_m: float = param(15.0, "1-NN distance of the last refinement step, m", 0.1, 1000.0)
+    refine_distance_m: float = param(15.0, "1-NN distance of the first refinement step, m", 0.1, 1000.0)
+    refine_last_distance_m: float = param(8.0, "1-NN distance of the last refinement step, m", 0.1, 1000.0)
     refine_iterations: int = param(6, "refinement steps while the distance shrinks", 1, 100)
     min_buildings: int = param(12, "fewest buildings in the map for a fix", 3, 100000)
-    min_jaccard: float = param(0.35, "smallest MNN-Jaccard of an accepted candidate", 0.0, 1.0)
-    max_log10_false_alarm: float = param(
-        -3.0, "log10 of the chance matches expected in the whole reference", -300.0, 10.0
+    min_jaccard: float = param(0.25, "smallest MNN-Jaccard of an accepted candidate", 0.0, 1.0)
+    min_log_odds: float = param(
+        5.0, "smallest evidence of an accepted candidate beyond what chance gives in the reference, nats", -300.0, 1e4
     )
     min_lead: float = param(1.3, "smallest MNN-Jaccard ratio to the best candidate elsewhere", 1.0, 100.0)
     rival_distance_m: float = param(200.0, "candidates further away than this are elsewhere, m", 0.0, 1e6)
@@ -47,3 +70,35 @@ class MatcherConfig:
     sigma_floor_m: float = param(3.0, "smallest horizontal standard deviation reported, m", 0.1, 1000.0)
     sigma_inflation: float = param(2.0, "factor on the residual-based standard deviation", 1.0, 100.0)
     sigma_up_m: float = param(100.0, "standard deviation reported for the altitude, m", 0.1, 10000.0)
+
+
+DEFAULT = "default"
+# The paper's stages and parameters; what it leaves open is said in docs/matching.md.
+PRESETS: Mapping[str, Mapping[str, Any]] = {
+    DEFAULT: {},
+    "paper": {
+        "tau_angle_deg": 15.0, "tau_perimeter": 0.3, "tau_shape": 0.3,
+        "score_angle_deg": 15.0, "score_perimeter": 1.0, "area_weight": 0.0, "centre_weight": 1.0,
+        "matches_per_star": 50, "votes": "score", "min_votes": 3, "top_k": 20, "selection": "rigid", "second_look": 0,
+        "mnn_distance_m": 10.0, "refine_distance_m": 50.0,
+        "refine_last_distance_m": 15.0,
+    },
+}  # fmt: skip
+
+
+def preset_values(name: str) -> dict[str, Any]:
+    """All parameters of a preset. Raises ConfigError for an unknown name."""
+    if name not in PRESETS:
+        raise ConfigError(f"preset {name} is unknown; there are {', '.join(PRESETS)}")
+    return {field.name: field.default for field in fields(MatcherConfig)} | dict(PRESETS[name])
+
+
+def matcher_config(values: Mapping[str, Any] | None = None) -> MatcherConfig:
+    """The config of named values over those of ``preset`` among them. Raises ConfigError."""
+    given = dict(values or {})
+    base = preset_values(str(given.pop("preset", DEFAULT)))
+    config = from_mapping(MatcherConfig, base | given)
+    for name, value, choices in (("votes", config.votes, VOTES), ("selection", config.selection, SELECTIONS)):
+        if value not in choices:
+            raise ConfigError(f"parameter {name} = {value} is not one of {', '.join(choices)}")
+    return config

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from buildloc_msgs_py.types import FloatArray
@@ -35,10 +35,11 @@ class Similarity:
         return np.asarray(self.world_m + self.scale * turned, dtype=np.float64)
 
 
-def fit_rigid(source_m: FloatArray, target_m: FloatArray) -> Similarity:
-    """Rotation and translation minimising sum |target - (R source + t)|^2, by SVD (Arun et al. 1987)."""
-    centre_s, centre_t = source_m.mean(axis=0), target_m.mean(axis=0)
-    u, _, vt = np.linalg.svd((source_m - centre_s).T @ (target_m - centre_t))
+def fit_rigid(source_m: FloatArray, target_m: FloatArray, weights: FloatArray | None = None) -> Similarity:
+    """Rotation and translation minimising sum w |target - (R source + t)|^2, by SVD (Arun et al. 1987)."""
+    w = np.ones(len(source_m)) if weights is None else weights
+    centre_s, centre_t = np.average(source_m, axis=0, weights=w), np.average(target_m, axis=0, weights=w)
+    u, _, vt = np.linalg.svd((source_m - centre_s).T @ ((target_m - centre_t) * w[:, None]))
     turn = vt.T @ np.diag([1.0, np.sign(np.linalg.det(vt.T @ u.T)) or 1.0]) @ u.T
     return Similarity(
         (float(centre_s[0]), float(centre_s[1])),
@@ -47,16 +48,14 @@ def fit_rigid(source_m: FloatArray, target_m: FloatArray) -> Similarity:
     )
 
 
-def fit_similarity(source_m: FloatArray, target_m: FloatArray, scale_gate: float) -> Similarity:
+def fit_similarity(
+    source_m: FloatArray, target_m: FloatArray, scale_gate: float, weights: FloatArray | None = None
+) -> Similarity:
     """The rigid fit with the least-squares scale, held within 1 +- scale_gate."""
-    rigid = fit_rigid(source_m, target_m)
-    centred = source_m - source_m.mean(axis=0)
-    spread = float(np.sum(centred**2))
-    along = float(np.sum((target_m - target_m.mean(axis=0)) * (centred @ rotation(rigid.yaw_rad).T)))
+    w = np.ones(len(source_m)) if weights is None else weights
+    rigid = fit_rigid(source_m, target_m, w)
+    centred = (source_m - rigid.anchor_m) @ rotation(rigid.yaw_rad).T
+    spread = float(np.sum(w[:, None] * centred**2))
+    along = float(np.sum(w[:, None] * (target_m - rigid.world_m) * centred))
     scale = along / spread if spread > 0.0 else 1.0
-    return Similarity(
-        rigid.anchor_m,
-        rigid.world_m,
-        rigid.yaw_rad,
-        min(1.0 + scale_gate, max(1.0 - scale_gate, scale)),
-    )
+    return replace(rigid, scale=min(1.0 + scale_gate, max(1.0 - scale_gate, scale)))

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from buildloc_msgs_py.types import FloatArray
+from numpy.typing import NDArray
 
 from buildloc_matcher.config import MatcherConfig
-from buildloc_matcher.descriptors import Stars
 from buildloc_matcher.geometry import wrap
-from buildloc_matcher.matching import Matches
+from buildloc_matcher.matching import NOTHING, Matches
+from buildloc_matcher.reference.database import ReferenceDatabase
 
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """H hypotheses: world position of the query-map centre (H, 2) m, yaw (H,) rad, scale, weight."""
+    """H hypotheses: query star (H,), world places of its corners (H, 3, 2) m, world position of the
+    query-map centre (H, 2) m, yaw (H,) rad, scale (H,), vote (H,)."""
 
+    stars: NDArray[np.int64]
+    places_m: FloatArray
     positions_m: FloatArray
     yaws_rad: FloatArray
     scales: FloatArray
@@ -27,12 +31,20 @@ class Hypotheses:
     def __len__(self) -> int:
         return len(self.weights)
 
+    def weighted(self, weights: FloatArray) -> Hypotheses:
+        """The hypotheses whose new vote is positive."""
+        kept = weights > 0.0
+        return replace(
+            self, stars=self.stars[kept], places_m=self.places_m[kept], positions_m=self.positions_m[kept],
+            yaws_rad=self.yaws_rad[kept], scales=self.scales[kept], weights=weights[kept],
+        )  # fmt: skip
 
-def _complex(points_m: FloatArray) -> np.ndarray:
+
+def _complex(points_m: FloatArray) -> NDArray[np.complex128]:
     return np.asarray(points_m[..., 0] + 1j * points_m[..., 1])
 
 
-def _orientation(corners: np.ndarray) -> np.ndarray:
+def _orientation(corners: NDArray[np.complex128]) -> FloatArray:
     """Sign of the signed area of triangles (M, 3) of complex corners."""
     one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     return np.asarray(np.sign((np.conj(one) * two).imag))
@@ -40,20 +52,21 @@ def _orientation(corners: np.ndarray) -> np.ndarray:
 
 def hypothesize(
     matches: Matches,
-    query: Stars,
+    corners: NDArray[np.int64],
     query_centroids_m: FloatArray,
-    reference: Stars,
-    reference_centroids_m: FloatArray,
+    database: ReferenceDatabase,
     centre_m: FloatArray,
     config: MatcherConfig,
 ) -> Hypotheses:
-    """Similarities from matched central triangles; vertices correspond by their sorted angles.
+    """Similarities from matched central triangles, those of the map's stars at ``corners`` (S, 3); vertices correspond by their sorted angles.
 
     Mirrored pairs are rejected. The scale is the mean of the three edge ratios weighted by the query
-    edges (short edges carry the larger relative error); outside 1 +- scale_gate it is rejected.
+    edges (short edges carry the larger relative error); outside 1 +- scale_gate it is rejected. A vote
+    weighs the star score (Eq. 3).
     """
-    source = _complex(query_centroids_m[query.triangles[matches.query]])
-    target = _complex(reference_centroids_m[reference.triangles[matches.reference]])
+    stars, columns = np.nonzero(matches.reference != NOTHING)
+    places = database.star_corners(matches.reference[stars, columns])
+    source, target = _complex(query_centroids_m[corners[stars]]), _complex(places)
     direct = _orientation(source) == _orientation(target)
     edges_source, edges_target = np.roll(source, -1, 1) - source, np.roll(target, -1, 1) - target
     scale = np.abs(edges_target).sum(axis=1) / np.maximum(np.abs(edges_source).sum(axis=1), 1e-12)
@@ -63,10 +76,12 @@ def hypothesize(
     centre = complex(centre_m[0], centre_m[1])
     moved = target.mean(axis=1) + scale * np.exp(1j * yaw) * (centre - source.mean(axis=1))
     return Hypotheses(
+        stars[kept],
+        places[kept],
         np.column_stack([moved.real, moved.imag])[kept],
         wrap(yaw[kept]),
         scale[kept],
-        matches.score[kept],
+        matches.score[stars, columns][kept].astype(np.float64),
         mirrored=int((~direct).sum()),
         off_scale=int((direct & ~on_scale).sum()),
     )

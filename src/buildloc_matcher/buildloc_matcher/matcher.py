@@ -2,39 +2,42 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
 from buildloc_msgs_py.config import check
-from buildloc_msgs_py.types import Candidate, Fix, FrameObservation, Keyframe, LocalMap, NoFix
+from buildloc_msgs_py.types import Candidate, Fix, FloatArray, FrameObservation, Keyframe, LocalMap, NoFix
 
-from buildloc_matcher.acceptance import (
-    acceptance_score,
-    lead,
-    log10_false_alarm,
-    refuse_coarse,
-    refuse_refined,
-)
+from buildloc_matcher.acceptance import lead, log_odds, refuse_coarse, refuse_refined
 from buildloc_matcher.config import MatcherConfig
-from buildloc_matcher.database import DatabaseError, ReferenceDatabase, descriptor_hash
-from buildloc_matcher.descriptors import stars
+from buildloc_matcher.evidence import QueryMap, query_map, seed_evidence
 from buildloc_matcher.geometry import Similarity
 from buildloc_matcher.hypotheses import hypothesize
-from buildloc_matcher.matching import match_stars
+from buildloc_matcher.local_map import check_map
+from buildloc_matcher.match_cache import MatchCache
+from buildloc_matcher.mesh import Mesh, mesh
+from buildloc_matcher.reference.database import DatabaseError, ReferenceDatabase, descriptor_hash
 from buildloc_matcher.refinement import covariance_enu, refine
-from buildloc_matcher.selection import Score, score_candidate
-from buildloc_matcher.voting import vote
+from buildloc_matcher.selection import Score, local_transform, select
+from buildloc_matcher.voting import Cluster, vote
+
+FEWEST_BUILDINGS = 4
 
 
 @dataclass(frozen=True)
 class MatchResult:
-    """Candidates, best MNN-Jaccard first, with their scores in the same order, and the funnel."""
+    """Candidates, best first, with their scores in the same order; the funnel counts what came of the
+    stars, and ``seconds`` tells how long each stage took."""
 
     candidates: tuple[Candidate, ...]
     scores: tuple[Score, ...]
+    query: QueryMap | None
     funnel: dict[str, float]
+    seconds: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -46,8 +49,24 @@ class Answer:
     funnel: dict[str, float]
 
 
+class _Clock:
+    """Adds up the seconds of named stages."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        started = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
+
+
 class Matcher:
-    """Locates local maps in one reference database; holds no state between calls."""
+    """Locates local maps in one reference database.
+
+    Between calls it keeps the matches of stars only: an answer depends on the map alone.
+    """
 
     def __init__(self, database: ReferenceDatabase, config: MatcherConfig) -> None:
         check(config)
@@ -58,65 +77,73 @@ class Matcher:
             )
         self.database = database
         self.config = config
+        self._cache = MatchCache(database.tables, config)
 
     def locate(self, local_map: LocalMap) -> MatchResult:
-        """Ranked candidates of a map; their x, y is where the mean of the map's buildings lies."""
-        config, database = self.config, self.database
-        started = time.perf_counter()
+        """Ranked candidates of a map; their x, y is where the mean of the map's buildings lies.
+
+        Raises MapError for a map that no flight makes.
+        """
+        check_map(local_map)
+        config, clock = self.config, _Clock()
         large = local_map.areas_m2 >= config.min_area_m2
-        points, shapes = local_map.centroids_m[large], local_map.shapes[large]
-        funnel: dict[str, float] = {"buildings": len(points)}
-        if len(points) < 4:
-            return MatchResult((), (), funnel | {"seconds": time.perf_counter() - started})
-        centre = points.mean(axis=0)
-        query = stars(points, shapes)
-        matches = match_stars(query, database.index, config)
-        hypotheses = hypothesize(matches, query, points, database.stars, database.centroids_m, centre, config)
-        ballot = vote(hypotheses, config)
-        scores = []
-        for cluster in ballot.clusters[: config.top_k]:
-            start = Similarity(
-                (float(centre[0]), float(centre[1])),
-                (cluster.x_m, cluster.y_m),
-                cluster.yaw_rad,
-                cluster.scale,
-            )
-            scores.append(
-                (cluster, score_candidate(start, points, database.centroids_m, database.tree, config))
-            )
-        scores.sort(key=lambda pair: (-pair[1].jaccard, -pair[0].votes))
-        ranked = [self._candidate(score, cluster.votes, centre) for cluster, score in scores]
-        if ranked:
-            ratio = funnel["lead"] = lead(ranked[0], ranked[1:], config)
-            first = acceptance_score(ranked[0].mnn_jaccard, ratio, config)
-            funnel["log10_false_alarm"] = log10_false_alarm(scores[0][1], database.area_m2, config)
-            ranked[0] = replace(ranked[0], acceptance=first)
-        funnel |= {
-            "query_stars": len(query),
-            "reference_stars": len(database.stars),
-            "compatible": matches.compatible,
+        points, areas, shapes = local_map.centroids_m[large], local_map.areas_m2[large], local_map.shapes[large]
+        buildings = {"buildings": len(points)}
+        if len(points) < FEWEST_BUILDINGS:
+            return MatchResult((), (), None, dict(buildings), clock.seconds)
+        query = query_map(points)
+        for thinnings in dict.fromkeys((0, config.second_look)):
+            with clock.stage("describe"):
+                found = mesh(points, areas, shapes, thinnings)
+            candidates, scores, funnel = self._look(found, query, clock)
+            if funnel.get("log_odds", -math.inf) >= config.min_log_odds:
+                break
+        return MatchResult(candidates, scores, query, buildings | funnel | {"thinnings": thinnings}, clock.seconds)
+
+    def _look(
+        self, found: Mesh, query: QueryMap, clock: _Clock
+    ) -> tuple[tuple[Candidate, ...], tuple[Score, ...], dict[str, float]]:
+        """Once from stars to ranked candidates."""
+        config, reference = self.config, self.database.ground
+        centre = query.points_m.mean(axis=0)
+        with clock.stage("match"):
+            matches = self._cache.match(found.stars)
+        with clock.stage("hypothesize"):
+            hypotheses = hypothesize(matches, found.corners, query.points_m, self.database, centre, config)
+        with clock.stage("vote"):
+            voters = hypotheses
+            if config.votes == "evidence":
+                seeds = (hypotheses.stars, hypotheses.places_m)
+                voters = hypotheses.weighted(seed_evidence(query, found.corners, *seeds, reference, config))
+            ballot = vote(voters, config)
+        with clock.stage("select"):
+            selected = select(ballot, voters, found.corners, query, reference, config)
+            candidates = tuple(self._candidate(c, score, centre, query) for c, score in selected)
+        funnel: dict[str, float] = {
+            "stars": len(found.stars),
+            "stars_matched_anew": self._cache.matched_anew,
+            "pairs_tested": matches.tested,
+            "pairs_passed": matches.passed,
             "matches": len(matches),
             "mirrored": hypotheses.mirrored,
             "off_scale": hypotheses.off_scale,
             "hypotheses": len(hypotheses),
+            "voters": len(voters),
             "bins": ballot.bins,
-            "inconsistent_bins": ballot.inconsistent,
-            "clusters": len(ballot.clusters),
-            "rescored": len(ranked),
-            "seconds": time.perf_counter() - started,
+            "clusters": ballot.consistent,
+            "rescored": len(ballot.clusters),
         }
-        return MatchResult(tuple(ranked), tuple(score for _, score in scores), funnel)
+        if candidates:
+            funnel["lead"] = lead(candidates[0], candidates[1:], config)
+            funnel["log_odds"] = candidates[0].acceptance
+        return candidates, tuple(score for _, score in selected), funnel
 
-    def _candidate(self, score: Score, votes: float, centre: np.ndarray) -> Candidate:
-        place = score.transform.apply(centre[None])[0]
+    def _candidate(self, cluster: Cluster, score: Score, centre: FloatArray, query: QueryMap) -> Candidate:
+        near = local_transform(score, centre, query, self.database.ground, self.config)
+        place = near.apply(centre[None])[0]
+        odds = log_odds(score.evidence, self.database.area_m2, self.config)
         return Candidate(
-            float(place[0]),
-            float(place[1]),
-            score.transform.yaw_rad,
-            score.transform.scale,
-            votes,
-            score.jaccard,
-            min(1.0, score.jaccard / self.config.min_jaccard) if self.config.min_jaccard > 0.0 else 1.0,
+            float(place[0]), float(place[1]), near.yaw_rad, near.scale, cluster.votes, score.jaccard, odds
         )
 
     def refuse(self, found: MatchResult) -> str | None:
@@ -126,15 +153,20 @@ class Matcher:
             return f"map has {buildings:.0f} buildings, fewer than {self.config.min_buildings}"
         if not found.candidates:
             return "no candidate: no place in the reference gathers enough consistent votes"
-        best, funnel = found.scores[0], found.funnel
-        return refuse_coarse(best, funnel["lead"], funnel["log10_false_alarm"], self.config)
+        funnel = found.funnel
+        return refuse_coarse(found.scores[0], funnel["lead"], funnel["log_odds"], self.config)
+
+    def place(self, found: MatchResult, at_m: FloatArray) -> Similarity:
+        """The best candidate's similarity map -> world around a point (2,) of the map."""
+        assert found.query is not None
+        return local_transform(found.scores[0], at_m, found.query, self.database.ground, self.config)
 
     def fix(
         self, local_map: LocalMap, keyframes: Sequence[Keyframe], observations: Sequence[FrameObservation]
     ) -> Answer:
         """The position of the camera at the last keyframe, or why there is none."""
         found = self.locate(local_map)
-        funnel = dict(found.funnel)
+        funnel = found.funnel | {f"{stage}_seconds": seconds for stage, seconds in found.seconds.items()}
 
         def none(reason: str) -> Answer:
             return Answer(NoFix(local_map.stamp_ns, reason), found.candidates, funnel)
@@ -144,20 +176,14 @@ class Matcher:
         refused = self.refuse(found)
         if refused is not None:
             return none(refused)
-        refined = refine(
-            found.scores[0].transform,
-            keyframes,
-            observations,
-            self.database.centroids_m,
-            self.database.tree,
-            self.config,
-        )
+        last = max(keyframes, key=lambda k: k.stamp_ns)
+        coarse = self.place(found, np.array([last.x_m, last.y_m]))
+        refined = refine(coarse, keyframes, observations, self.database.ground, self.config)
         refused = refuse_refined(refined, self.config)
         if refined is None or refused is not None:
             return none(refused or "refinement failed")
         funnel |= {"refine_observed": refined.observed, "refine_pairs": refined.pairs}
         funnel |= {"refine_buildings": refined.buildings, "refine_rms_m": refined.rms_m}
-        last = max(keyframes, key=lambda k: k.stamp_ns)
         altitude = next((o.altitude_m for o in observations if o.stamp_ns == last.stamp_ns), float("nan"))
         east, north = float(refined.position_m[0]), float(refined.position_m[1])
         latitude, longitude = self.database.to_wgs84(east, north)

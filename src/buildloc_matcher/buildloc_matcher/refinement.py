@@ -11,7 +11,9 @@ from buildloc_msgs_py.types import FloatArray, FrameObservation, Keyframe
 from scipy.spatial import cKDTree
 
 from buildloc_matcher.config import MatcherConfig
+from buildloc_matcher.evidence import Ground
 from buildloc_matcher.geometry import Similarity, fit_rigid, rotation
+from buildloc_matcher.point_grid import within
 
 
 @dataclass(frozen=True)
@@ -47,8 +49,7 @@ def refine(
     coarse: Similarity,
     keyframes: Sequence[Keyframe],
     observations: Sequence[FrameObservation],
-    reference_m: FloatArray,
-    tree: cKDTree,
+    reference: Ground,
     config: MatcherConfig,
 ) -> Refined | None:
     """Correct the coarse pose of the last keyframe; None when fewer than three pairs are found.
@@ -64,6 +65,12 @@ def refine(
     yaw = coarse.yaw_rad + last.yaw_rad
     if len(points) == 0:
         return None
+    reach = 2.0 * config.refine_distance_m
+    rows = within(reference.grid, *(points.min(axis=0) - reach), *(points.max(axis=0) + reach))
+    if len(rows) == 0:
+        return None
+    reference_m = reference.buildings_m[rows]
+    tree = cKDTree(reference_m)
     shrink = np.geomspace(config.refine_distance_m, config.refine_last_distance_m, config.refine_iterations)
     for distance_m in shrink:
         distance, nearest = tree.query(points)

@@ -7,16 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from buildloc_msgs_py.types import FloatArray
+from numba import njit
 from numpy.typing import NDArray
 
 from buildloc_matcher.config import MatcherConfig
-from buildloc_matcher.geometry import wrap
 from buildloc_matcher.hypotheses import Hypotheses
 
 
 @dataclass(frozen=True)
 class Cluster:
-    """A rotation-consistent cluster of one bin: its vote-weighted mean transform and its votes."""
+    """A rotation-consistent cluster of one bin: its vote-weighted mean transform, its votes, the number of
+    its members and the row of the hypothesis with the largest vote among them."""
 
     x_m: float
     y_m: float
@@ -24,27 +25,47 @@ class Cluster:
     scale: float
     votes: float
     members: int
+    best: int
 
 
 @dataclass(frozen=True)
 class Ballot:
-    """Clusters by falling votes, the number of bins hit and of bins without a consistent cluster."""
+    """The ``top_k`` clusters by falling votes, the number of bins hit and of bins with a consistent one."""
 
     clusters: tuple[Cluster, ...]
     bins: int
-    inconsistent: int
+    consistent: int
 
 
-def consistent(yaws_rad: FloatArray, weights: FloatArray, tolerance_rad: float) -> NDArray[np.int64]:
-    """Indices of the heaviest set of yaws within the tolerance of one of them."""
-    order = np.argsort(wrap(yaws_rad), kind="stable")
-    turned = np.concatenate([wrap(yaws_rad)[order] + shift for shift in (-2 * math.pi, 0.0, 2 * math.pi)])
-    total = np.concatenate([[0.0], np.cumsum(np.tile(weights[order], 3))])
-    own = turned[len(order) : 2 * len(order)]
-    first = np.searchsorted(turned, own - tolerance_rad, "left")
-    last = np.searchsorted(turned, own + tolerance_rad, "right")
-    best = int(np.argmax(total[last] - total[first]))
-    return np.asarray(np.unique(order[np.arange(first[best], last[best]) % len(order)]), dtype=np.int64)
+@njit(nogil=True, cache=True)
+def _consistent(yaws, weights, begin, end, tolerance):  # type: ignore[no-untyped-def]
+    """The yaw of a bin's rows [begin, end) whose neighbours within the tolerance weigh most; first wins."""
+    best, heaviest = yaws[begin], -1.0
+    for i in range(begin, end):
+        total = 0.0
+        for j in range(begin, end):
+            if abs((yaws[j] - yaws[i] + math.pi) % (2.0 * math.pi) - math.pi) <= tolerance:
+                total += weights[j]
+        if total > heaviest:
+            best, heaviest = yaws[i], total
+    return best
+
+
+@njit(nogil=True, cache=True)
+def _clusters(starts, positions, yaws, scales, weights, tolerance, out):  # type: ignore[no-untyped-def]
+    """Per bin: x, y, yaw, scale, votes, members, best row of its heaviest rotation-consistent set."""
+    for b in range(len(starts) - 1):
+        centre = _consistent(yaws, weights, starts[b], starts[b + 1], tolerance)
+        x, y, scale, c, s, votes, members, best = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, -1
+        for i in range(starts[b], starts[b + 1]):
+            if abs((yaws[i] - centre + math.pi) % (2.0 * math.pi) - math.pi) > tolerance:
+                continue
+            w = weights[i]
+            x, y, scale = x + w * positions[i, 0], y + w * positions[i, 1], scale + w * scales[i]
+            c, s, votes, members = c + w * math.cos(yaws[i]), s + w * math.sin(yaws[i]), votes + w, members + 1
+            if best < 0 or w > weights[best]:
+                best = i
+        out[b] = (x / votes, y / votes, math.atan2(s, c), scale / votes, votes, members, best)
 
 
 def vote(hypotheses: Hypotheses, config: MatcherConfig) -> Ballot:
@@ -52,29 +73,18 @@ def vote(hypotheses: Hypotheses, config: MatcherConfig) -> Ballot:
     if len(hypotheses) == 0:
         return Ballot((), 0, 0)
     keys = np.round(hypotheses.positions_m / config.bin_size_m).astype(np.int64)
-    _, bins, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
-    order = np.argsort(bins.reshape(-1), kind="stable")
-    starts = np.concatenate([[0], np.cumsum(counts)])
-    tolerance = math.radians(config.rotation_tolerance_deg)
-    clusters = []
-    for b in np.flatnonzero(counts >= config.min_votes):
-        inside = order[starts[b] : starts[b + 1]]
-        group = inside[consistent(hypotheses.yaws_rad[inside], hypotheses.weights[inside], tolerance)]
-        if len(group) < config.min_votes:
-            continue
-        weights = hypotheses.weights[group]
-        position = np.average(hypotheses.positions_m[group], axis=0, weights=weights)
-        yaw = np.angle(np.sum(weights * np.exp(1j * hypotheses.yaws_rad[group])))
-        scale = np.average(hypotheses.scales[group], weights=weights)
-        clusters.append(
-            Cluster(
-                float(position[0]),
-                float(position[1]),
-                float(yaw),
-                float(scale),
-                float(weights.sum()),
-                len(group),
-            )
-        )
-    clusters.sort(key=lambda c: (-c.votes, c.x_m, c.y_m))
-    return Ballot(tuple(clusters), len(counts), len(counts) - len(clusters))
+    order = np.lexsort((keys[:, 1], keys[:, 0]))
+    changes = np.flatnonzero(np.any(np.diff(keys[order], axis=0), axis=1)) + 1
+    starts = np.concatenate([[0], changes, [len(order)]])
+    table: NDArray[np.float64] = np.empty((len(starts) - 1, 7))
+    _clusters(
+        starts, hypotheses.positions_m[order], hypotheses.yaws_rad[order], hypotheses.scales[order],
+        hypotheses.weights[order], math.radians(config.rotation_tolerance_deg), table,
+    )  # fmt: skip
+    consistent = table[table[:, 5] >= config.min_votes]
+    ranked: FloatArray = consistent[np.lexsort((consistent[:, 1], consistent[:, 0], -consistent[:, 4]))]
+    clusters = tuple(
+        Cluster(x, y, yaw, scale, votes, int(members), int(order[int(best)]))
+        for x, y, yaw, scale, votes, members, best in ranked[: config.top_k].tolist()
+    )
+    return Ballot(clusters, len(table), len(consistent))

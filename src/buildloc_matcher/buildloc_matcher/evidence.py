@@ -1,0 +1,200 @@
+"""How much the buildings around a hypothesis speak for it: log-likelihood ratios against chance.
+
+A building of the map is seen in the reference with probability ``match_share`` and then lies where the
+hypothesis puts it, up to a Gaussian error; else, or if the hypothesis is wrong, the nearest reference
+building is as near as the local density of buildings has it. Nats throughout.
+"""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from buildloc_msgs_py.types import FloatArray
+from numba import njit
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
+from scipy.spatial import cKDTree
+
+from buildloc_matcher.config import MatcherConfig
+from buildloc_matcher.matching import THREADS
+from buildloc_matcher.point_grid import PointGrid, grid_points, nearest
+
+DENSITY_CELL_M = 100.0
+DENSITY_CELLS = 3
+MIN_DENSITY_PER_M2 = 2e-5
+NEIGHBOURS = 12
+WITNESSES = 16
+GATE_SIGMAS = 3.0
+MAX_GATE_M = 16.0
+HOPELESS = -5.0  # a hypothesis that has sunk below this is given up
+NO_MATCH = -1
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The buildings of the reference (N, 2), the same in a grid, and how dense they lie: (rows, columns) in
+    cells of DENSITY_CELL_M."""
+
+    buildings_m: FloatArray
+    grid: PointGrid
+    density_per_m2: FloatArray
+
+    @property
+    def frame(self) -> tuple[float, float, float, int, int]:
+        """The grid's frame as compiled loops take it."""
+        return self.grid.west_m, self.grid.south_m, self.grid.cell_m, self.grid.columns, self.grid.rows
+
+
+def ground(buildings_m: FloatArray) -> Ground:
+    """Buildings (N, 2) in a grid; the density is averaged over three by three cells."""
+    grid = grid_points(buildings_m)
+    column, row = ((grid.points_m - (grid.west_m, grid.south_m)) // DENSITY_CELL_M).astype(np.int64).T
+    counts = np.zeros((row.max() + 1, column.max() + 1))
+    np.add.at(counts, (row, column), 1.0)
+    mean = uniform_filter(counts, DENSITY_CELLS, mode="constant") / DENSITY_CELL_M**2
+    return Ground(buildings_m, grid, np.maximum(mean, MIN_DENSITY_PER_M2))
+
+
+@dataclass(frozen=True)
+class QueryMap:
+    """Buildings of the map (N, 2) metres, and of each its nearest others (N, NEIGHBOURS), nearest first."""
+
+    points_m: FloatArray
+    neighbours: NDArray[np.int64]
+
+
+def query_map(points_m: FloatArray) -> QueryMap:
+    """The map's buildings with their neighbourhoods; N >= 2."""
+    count = min(NEIGHBOURS, len(points_m) - 1)
+    _, near = cKDTree(points_m).query(points_m, k=count + 1)
+    return QueryMap(np.ascontiguousarray(points_m), np.ascontiguousarray(near[:, 1:].astype(np.int64)))
+
+
+def witnesses(points_m: FloatArray, triangles: NDArray[np.int32]) -> NDArray[np.int64]:
+    """(S, WITNESSES) map buildings nearest to each triangle (S, 3), its corners left out; NO_MATCH pads."""
+    found = np.full((len(triangles), WITNESSES), NO_MATCH, dtype=np.int64)
+    if not len(triangles):
+        return found
+    count = min(WITNESSES + 3, len(points_m))
+    _, near = cKDTree(points_m).query(points_m[triangles].mean(axis=1), k=count)
+    for row, (around, corners) in enumerate(zip(near, triangles, strict=True)):
+        others = around[~np.isin(around, corners)][:WITNESSES]
+        found[row, : len(others)] = others
+    return found
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _density(density, frame, x, y):  # type: ignore[no-untyped-def]
+    row = min(density.shape[0] - 1, max(0, int((y - frame[1]) / DENSITY_CELL_M)))
+    column = min(density.shape[1] - 1, max(0, int((x - frame[0]) / DENSITY_CELL_M)))
+    return density[row, column]
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _gain(squared, variance, gate, density, share):  # type: ignore[no-untyped-def]
+    """Log-likelihood ratio of one building: its nearest reference building at this squared distance, or
+    (negative) none within the gate."""
+    if squared < 0.0:
+        return math.log(1.0 - share) + math.pi * density * gate * gate
+    likely = share * math.exp(-0.5 * squared / variance) / (2.0 * math.pi * variance)
+    return math.log(likely / density * math.exp(math.pi * density * squared) + (1.0 - share))
+
+
+@njit(nogil=True, cache=True)
+def _seed_evidence(
+    query, stars, corners, others, places, points, starts, frame, density, sigma, share, out
+):  # type: ignore[no-untyped-def]
+    """Evidence of hypotheses: query triangle ``corners[stars[h]]`` lies on ``places[h]`` (3, 2).
+
+    The similarity of the three corners is carried outwards over the witnesses and refitted with each that
+    is found (running sums of a least-squares fit).
+    """
+    for h in range(len(stars)):
+        s = stars[h]
+        n, qx, qy, rx, ry, qq, real, imag = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        ox, oy = query[corners[s, 0], 0], query[corners[s, 0], 1]
+        wx, wy = places[h, 0, 0], places[h, 0, 1]
+        for k in range(3):
+            x, y = query[corners[s, k], 0] - ox, query[corners[s, k], 1] - oy
+            u, v = places[h, k, 0] - wx, places[h, k, 1] - wy
+            n += 1.0
+            qx, qy, rx, ry, qq = qx + x, qy + y, rx + u, ry + v, qq + x * x + y * y
+            real, imag = real + x * u + y * v, imag + x * v - y * u
+        total = 0.0
+        for w in range(others.shape[1]):
+            j = others[s, w]
+            if j == NO_MATCH:
+                break
+            spread = qq - (qx * qx + qy * qy) / n
+            a = (real - (qx * rx + qy * ry) / n) / spread
+            b = (imag - (qx * ry - qy * rx) / n) / spread
+            x, y = query[j, 0] - ox, query[j, 1] - oy
+            dx, dy = x - qx / n, y - qy / n
+            u, v = rx / n + a * dx - b * dy, ry / n + b * dx + a * dy
+            variance = sigma * sigma * (1.0 + 1.0 / n + (dx * dx + dy * dy) / spread)
+            gate = min(MAX_GATE_M, GATE_SIGMAS * math.sqrt(variance))
+            place, squared = nearest(points, starts, frame, wx + u, wy + v, gate)
+            here = _density(density, frame, wx + u, wy + v)
+            if place < 0:
+                total += _gain(-1.0, variance, gate, here, share)
+            else:
+                total += _gain(squared, variance, gate, here, share)
+                u, v = points[place, 0] - wx, points[place, 1] - wy
+                n += 1.0
+                qx, qy, rx, ry, qq = qx + x, qy + y, rx + u, ry + v, qq + x * x + y * y
+                real, imag = real + x * u + y * v, imag + x * v - y * u
+            if total < HOPELESS:
+                break
+        out[h] = total
+
+
+def seed_evidence(
+    query: QueryMap,
+    triangles: NDArray[np.int32],
+    stars: NDArray[np.int64],
+    places_m: FloatArray,
+    reference: Ground,
+    config: MatcherConfig,
+) -> FloatArray:
+    """(H,) nats for hypotheses that lay map triangle ``stars[h]`` (rows of ``triangles``) on places (H, 3, 2)."""
+    out = np.empty(len(stars))
+    others = witnesses(query.points_m, triangles)
+    parts = np.array_split(np.arange(len(stars)), THREADS)
+
+    def work(part: NDArray[np.int64]) -> None:
+        if len(part):
+            rows = slice(part[0], part[-1] + 1)
+            _seed_evidence(
+                query.points_m, stars[rows], triangles, others, places_m[rows], reference.grid.points_m,
+                reference.grid.starts, reference.frame, reference.density_per_m2, config.sigma_m,
+                config.match_share, out[rows],
+            )  # fmt: skip
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        list(pool.map(work, parts))
+    return out
+
+
+@njit(nogil=True, cache=True)
+def _placed_evidence(moved, points, starts, frame, density, sigma, share):  # type: ignore[no-untyped-def]
+    total = 0.0
+    gate = min(MAX_GATE_M, GATE_SIGMAS * sigma)
+    for j in range(len(moved)):
+        place, squared = nearest(points, starts, frame, moved[j, 0], moved[j, 1], gate)
+        here = _density(density, frame, moved[j, 0], moved[j, 1])
+        total += _gain(squared if place >= 0 else -1.0, sigma * sigma, gate, here, share)
+    return total
+
+
+def placed_evidence(moved_m: FloatArray, reference: Ground, config: MatcherConfig) -> float:
+    """Nats for a map whose buildings lie at (N, 2) in the world."""
+    grid = reference.grid
+    return float(
+        _placed_evidence(
+            moved_m, grid.points_m, grid.starts, reference.frame, reference.density_per_m2, config.sigma_m,
+            config.match_share,
+        )  # fmt: skip
+    )

@@ -1,0 +1,193 @@
+"""A match that grows: from a seed over neighbouring buildings, with a similarity that follows the map's bend.
+
+One rigid transform for a whole flight throws true matches away where the stitched map has bent. Here every
+building is looked for where its matched neighbours predict it.
+"""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from buildloc_msgs_py.types import FloatArray
+from numba import njit
+from numpy.typing import NDArray
+
+from buildloc_matcher.config import MatcherConfig
+from buildloc_matcher.evidence import (
+    GATE_SIGMAS,
+    MAX_GATE_M,
+    NO_MATCH,
+    Ground,
+    QueryMap,
+    _density,
+    _gain,
+)
+from buildloc_matcher.matching import THREADS
+from buildloc_matcher.point_grid import nearest
+
+UNKNOWN = -2
+HELPFUL_M = 40.0  # neighbours further away than this predict worse
+STIFFNESS_M2 = 3.0 * 60.0**2  # how much a building's turn and scale hold to those of its neighbours
+PASSES = 2
+GIVE_UP = -12.0
+
+
+@dataclass(frozen=True)
+class Grown:
+    """``matches`` (N,) rows of the reference's buildings, NO_MATCH where there is none; ``predicted`` (N, 2)
+    where the match puts every building of the map (NaN where it never got); ``evidence`` in nats."""
+
+    matches: NDArray[np.int64]
+    predicted_m: FloatArray
+    evidence: float
+
+
+@njit(nogil=True, cache=True)
+def _predict(j, query, near, state, points, turn, sigma):  # type: ignore[no-untyped-def]
+    """Where matched neighbours put building j: x, y, its turn (a, b), variance; weight 0 without any."""
+    x, y, a, b, weight, squares, lever = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(near.shape[1]):
+        i = near[j, k]
+        if state[i] < 0:
+            continue
+        dx, dy = query[j, 0] - query[i, 0], query[j, 1] - query[i, 1]
+        squared = dx * dx + dy * dy
+        w = 1.0 / (1.0 + squared / (HELPFUL_M * HELPFUL_M))
+        x += w * (points[state[i], 0] + turn[i, 0] * dx - turn[i, 1] * dy)
+        y += w * (points[state[i], 1] + turn[i, 1] * dx + turn[i, 0] * dy)
+        a, b = a + w * turn[i, 0], b + w * turn[i, 1]
+        weight, squares, lever = weight + w, squares + w * w, lever + w * squared
+    if weight == 0.0:
+        return 0.0, 0.0, 1.0, 0.0, 0.0, 0.0
+    # The neighbours' own errors average out; their turns share one, which grows with the distance.
+    variance = sigma * sigma * (1.0 + squares / (weight * weight) + lever / weight / STIFFNESS_M2)
+    return x / weight, y / weight, a / weight, b / weight, variance, weight
+
+
+@njit(nogil=True, cache=True)
+def _turn(j, query, near, state, points, turn, a, b):  # type: ignore[no-untyped-def]
+    """Turn and scale (a, b) at building j from its matched neighbours, held to the given one."""
+    real, imag, spread = a * STIFFNESS_M2, b * STIFFNESS_M2, STIFFNESS_M2
+    for k in range(near.shape[1]):
+        i = near[j, k]
+        if state[i] < 0:
+            continue
+        x, y = query[j, 0] - query[i, 0], query[j, 1] - query[i, 1]
+        u, v = points[state[j], 0] - points[state[i], 0], points[state[j], 1] - points[state[i], 1]
+        real, imag, spread = real + x * u + y * v, imag + x * v - y * u, spread + x * x + y * y
+    turn[j, 0], turn[j, 1] = real / spread, imag / spread
+
+
+@njit(nogil=True, cache=True)
+def _grow(query, near, corners, places, a, b, points, starts, frame, density, sigma, share, state, predicted):  # type: ignore[no-untyped-def]
+    """Fill ``state`` (N,) and ``predicted`` (N, 2) from three corners that lie on ``places``; the evidence."""
+    count = len(query)
+    turn = np.empty((count, 2))
+    support = np.zeros(count)
+    for j in range(count):
+        state[j] = UNKNOWN
+        predicted[j, 0] = predicted[j, 1] = math.nan
+    for k in range(3):
+        state[corners[k]] = places[k]
+    for k in range(3):
+        _turn(corners[k], query, near, state, points, turn, a, b)
+        for m in range(near.shape[1]):
+            support[near[corners[k], m]] += 1.0
+    total, tried = 0.0, 0
+    while True:
+        # Next comes the building with the most matched neighbours: the surest prediction.
+        j = -1
+        for i in range(count):
+            if state[i] == UNKNOWN and support[i] > 0.0 and (j < 0 or support[i] > support[j]):
+                j = i
+        if j < 0:
+            break
+        x, y, a, b, variance, weight = _predict(j, query, near, state, points, turn, sigma)
+        if weight == 0.0:
+            support[j] = 0.0
+            continue
+        gate = min(MAX_GATE_M, GATE_SIGMAS * math.sqrt(variance))
+        place, squared = nearest(points, starts, frame, x, y, gate)
+        taken = False
+        for i in range(count):
+            if place >= 0 and state[i] == place:
+                taken = True
+        if place < 0 or taken:
+            state[j] = NO_MATCH
+            total += _gain(-1.0, variance, gate, _density(density, frame, x, y), share)
+        else:
+            state[j] = place
+            total += _gain(squared, variance, gate, _density(density, frame, x, y), share)
+            _turn(j, query, near, state, points, turn, a, b)
+            for m in range(near.shape[1]):
+                support[near[j, m]] += 1.0
+        tried += 1
+        if total < GIVE_UP:
+            return total
+    # Once more with all neighbours known: early guesses are put right, and the evidence is the final one.
+    for _ in range(PASSES):
+        total = 0.0
+        for j in range(count):
+            x, y, a, b, variance, weight = _predict(j, query, near, state, points, turn, sigma)
+            if weight == 0.0:
+                if state[j] >= 0:
+                    state[j] = NO_MATCH
+                continue
+            predicted[j, 0], predicted[j, 1] = x, y
+            gate = min(MAX_GATE_M, GATE_SIGMAS * math.sqrt(variance))
+            place, squared = nearest(points, starts, frame, x, y, gate)
+            taken = False
+            for i in range(count):
+                if place >= 0 and i != j and state[i] == place:
+                    taken = True
+            here = _density(density, frame, x, y)
+            if place < 0 or taken:
+                state[j] = NO_MATCH
+                total += _gain(-1.0, variance, gate, here, share)
+            else:
+                state[j] = place
+                total += _gain(squared, variance, gate, here, share)
+                _turn(j, query, near, state, points, turn, a, b)
+    return total
+
+
+def grow(
+    query: QueryMap,
+    corners: NDArray[np.int32],
+    places_m: FloatArray,
+    reference: Ground,
+    config: MatcherConfig,
+) -> list[Grown]:
+    """Grow a match from each seed: map triangle ``corners`` (C, 3) on the places (C, 3, 2) of reference
+    buildings."""
+    count = len(query.points_m)
+    states = np.empty((len(corners), count), dtype=np.int64)
+    predicted = np.empty((len(corners), count, 2))
+    evidence = np.empty(len(corners))
+    xy = query.points_m[corners]
+    source, target = xy[..., 0] + 1j * xy[..., 1], places_m[..., 0] + 1j * places_m[..., 1]
+    edges, moved = np.roll(source, -1, 1) - source, np.roll(target, -1, 1) - target
+    turns = (np.conj(edges) * moved).sum(axis=1) / np.maximum((np.abs(edges) ** 2).sum(axis=1), 1e-9)
+
+    def work(c: int) -> None:
+        seats = np.empty(3, dtype=np.int64)
+        for k in range(3):
+            seats[k], _ = nearest(
+                reference.grid.points_m, reference.grid.starts, reference.frame, places_m[c, k, 0], places_m[c, k, 1], 0.01
+            )
+        evidence[c] = _grow(
+            query.points_m, query.neighbours, corners[c], seats, turns[c].real, turns[c].imag,
+            reference.grid.points_m, reference.grid.starts, reference.frame, reference.density_per_m2, config.sigma_m, config.match_share,
+            states[c], predicted[c],
+        )  # fmt: skip
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        list(pool.map(work, range(len(corners))))
+    grown = []
+    for state, places, nats in zip(states, predicted, evidence, strict=True):
+        matched = np.where(state >= 0, reference.grid.order[np.maximum(state, 0)], NO_MATCH)
+        grown.append(Grown(matched, places, float(nats)))
+    return grown
