@@ -1,4 +1,4 @@
-"""Reference databases and footprint files for tests, good and bad: the one place that knows how to spoil them."""
+"""Reference databases and footprint files, good and bad: the one place that knows how to spoil them."""
 
 from __future__ import annotations
 
