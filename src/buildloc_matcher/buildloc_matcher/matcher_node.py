@@ -54,7 +54,7 @@ class MatcherNode(Node):  # type: ignore[misc]
             (
                 QuaternionStamped,
                 topics.GIMBAL_ATTITUDE,
-                qos.SENSOR,
+                qos.TELEMETRY,
                 partial(telemetry, topics.GIMBAL_ATTITUDE),
             ),
             (Image, topics.MASK, qos.SENSOR, partial(self._guarded, self._on_mask)),
@@ -81,8 +81,7 @@ class MatcherNode(Node):  # type: ignore[misc]
         self._submit(self.session.add_keyframes(wire.decode_keyframes(message)))
 
     def _on_database(self, message: String) -> None:
-        if message.data != self.session.database_path:
-            self._worker.submit(self._load, message.data)
+        self._worker.submit(self._load, message.data)
 
     def _load(self, path: str) -> None:
         if self.session.load(path):
