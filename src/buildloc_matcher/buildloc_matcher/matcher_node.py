@@ -23,7 +23,7 @@ from nav_msgs.msg import Path
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image, NavSatFix, PointCloud2, Range
-from std_msgs.msg import String
+from std_msgs.msg import Empty, String
 
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.session import Job, Session
@@ -60,6 +60,7 @@ class MatcherNode(Node):  # type: ignore[misc]
             (Image, topics.MASK, qos.SENSOR, partial(self._guarded, self._on_mask)),
             (PointCloud2, topics.MAP, qos.SENSOR, partial(self._guarded, self._on_map)),
             (Path, topics.KEYFRAMES, qos.SENSOR, partial(self._guarded, self._on_keyframes)),
+            (Empty, topics.RESET_DONE, qos.SENSOR, lambda _: self.session.reset()),
             (String, topics.REFERENCE_DATABASE, qos.LATCHED, self._on_database),
         ):
             self.create_subscription(kind, topic, handle, profile)

@@ -41,6 +41,11 @@ class Series(Generic[T]):
         if len(self._stamps) > HISTORY:
             del self._values[self._stamps.pop(0)]
 
+    def clear(self) -> None:
+        """Forget all values."""
+        self._stamps.clear()
+        self._values.clear()
+
     def settled(self, stamp_ns: int) -> bool:
         """Whether no later message of an ordered topic can be nearer to ``stamp_ns``."""
         if self._max_age_ns is None:
@@ -93,6 +98,11 @@ class Telemetry:
     def at(self, stamp_ns: int) -> tuple[CameraModel, float, Attitude]:
         """Camera, altitude (m) and attitude (x, y, z, w) of an image; WireError says what is missing."""
         return self.camera.at(stamp_ns), self.altitude.at(stamp_ns), self.attitude.at(stamp_ns)
+
+    def reset(self) -> None:
+        """Forget the flight. The intrinsics stay: they are the camera's, which may publish them only once."""
+        self.altitude.clear()
+        self.attitude.clear()
 
     def missing(self) -> tuple[str, ...]:
         """Topics of which nothing was received."""
@@ -155,6 +165,12 @@ class FramePairing:
         done = [self._complete(waiting) for waiting in self._waiting]
         self._waiting.clear()
         return done
+
+    def reset(self) -> None:
+        """Forget the flight: waiting images and telemetry, whose stamps the next flight may have too."""
+        self.telemetry.reset()
+        self._waiting.clear()
+        self._last_stamp_ns = -1
 
     def _complete(self, waiting: _Waiting) -> Frame | FrameFault:
         try:
