@@ -71,9 +71,9 @@ class Drone(Node):  # type: ignore[misc]
             assert time.monotonic() < deadline, {s.name: s.message for s in self.states.values()}
             self.executor_.spin_once(timeout_sec=0.02)
 
-    def connected(self, publishers: list[Any], subscribers: int) -> bool:
-        """Whether these publishers and the drone's own inputs have that many subscribers each."""
-        return all(p.get_subscription_count() >= subscribers for p in (*publishers, *self.inputs.values()))
+    def connected(self, subscribers: int) -> bool:
+        """Whether every input has that many subscribers."""
+        return all(p.get_subscription_count() >= subscribers for p in self.inputs.values())
 
     def call(self, kind: Any, service: str, request: Any) -> Any:
         """The response of a service."""
