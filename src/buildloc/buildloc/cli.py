@@ -292,8 +292,8 @@ def _replay(args: argparse.Namespace) -> int:
         print(describe(result))
     print(
         f"{len(accepted)} fixes received on /buildloc/fix; {report.images} images, {report.dropped} dropped, "
-        f"{report.frames_unusable} unusable, {report.keyframes} keyframes, {report.maps} maps, "
-        f"{report.maps_skipped} overtaken; {report.seconds:.1f} s"
+        f"{report.frames_unusable} unusable, {report.keyframes} keyframes, {report.keyframes_lost} lost, "
+        f"{report.maps} maps, {report.maps_skipped} overtaken; {report.seconds:.1f} s"
     )
     return 0
 

@@ -58,9 +58,11 @@ class MapperNode(Node):  # type: ignore[misc]
             self._update(self._frames.pop(stamp_ns), self._masks.pop(stamp_ns))
         while len(self._frames) > FRAMES_KEPT:
             self._frames.pop(next(iter(self._frames)))
-        while len(self._masks) > FRAMES_KEPT:
-            self._masks.pop(next(iter(self._masks)))
+        newest = next(reversed(self._frames), 0)
+        for late in [mask for mask in self._masks if mask < newest]:  # images are in order: its own is gone
+            del self._masks[late]
             self._dropped += 1
+            self._report(DiagnosticStatus.WARN, "a mask came too late for its image; use a faster network")
 
     def _update(self, frame: Frame, mask: Mask) -> None:
         self._received += 1
