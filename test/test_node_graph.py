@@ -131,7 +131,7 @@ def test_bad_databases_are_refused_and_the_good_one_stays_in_use(
         expected = codes.RESULT_MAP_DOES_NOT_EXIST if kind == "missing" else codes.RESULT_INVALID_MAP_DATA
         assert graph.load(bad) == expected, kind
         graph.until(lambda text=text: graph.said(REFERENCE_DB, ERROR, text))
-        graph.no_fix()
+        graph.no_fix(count=1)
         assert graph.uses(folder / "good.bldb") and graph.matcher.session.matcher is used
     assert graph.load(folder / "good.bldb") == LoadMap.Response.RESULT_SUCCESS
     graph.until(lambda: graph.states[REFERENCE_DB].level == OK)
