@@ -1,6 +1,6 @@
 # make demo | test | lint | colcon | lock | clean. Everything runs in .venv, made from requirements.lock.
 PYTHON ?= python3
-PYTEST_ARGS ?= -n 2
+PYTEST_ARGS ?= -n 2 --dist loadgroup
 VENV := .venv
 BIN := $(VENV)/bin
 PACKAGES := msgs_py segmenter mapper matcher

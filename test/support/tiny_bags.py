@@ -22,8 +22,12 @@ def write_bag(
     altitude_m: float = 100.0,
     info_width: int = WIDTH,
     encoding: str | None = None,
+    bad_altitude_at: tuple[int, ...] = (),
 ) -> Path:
-    """Frames at 1 Hz from stamp 1 s, with telemetry of the same stamps; ``encoding``: raw images of it."""
+    """Frames at 1 Hz from stamp 1 s, with telemetry of the same stamps.
+
+    ``encoding``: raw images of it. ``bad_altitude_at``: seconds at which the altitude is NaN.
+    """
     types = STORE.types
     rng = np.random.default_rng(5)
 
@@ -38,12 +42,13 @@ def write_bag(
         k = np.array([80.0, 0, 47.5, 0, 80.0, 31.5, 0, 0, 1])
         jpeg = np.frombuffer(cv2.imencode(".jpg", image)[1].tobytes(), dtype=np.uint8)
         compressed = types["sensor_msgs/msg/CompressedImage"](h, "jpeg", jpeg)
+        height_m = math.nan if stamp_ns // SECOND in bad_altitude_at else altitude_m
         raw = types["sensor_msgs/msg/Image"](h, HEIGHT, WIDTH, encoding or "", 0, 3 * WIDTH, image.ravel())
         return {
             "/camera/camera_info": types["sensor_msgs/msg/CameraInfo"](
                 h, HEIGHT, info_width, "plumb_bob", np.empty(0), k, np.eye(3).ravel(), np.zeros(12), 0, 0, roi
             ),
-            "/altitude": types["sensor_msgs/msg/Range"](h, 1, 0.1, 0.0, math.inf, altitude_m, 0.0),
+            "/altitude": types["sensor_msgs/msg/Range"](h, 1, 0.1, 0.0, math.inf, height_m, 0.0),
             "/gimbal/attitude": types["geometry_msgs/msg/QuaternionStamped"](
                 h, types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
             ),

@@ -9,11 +9,15 @@ import math
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from buildloc_msgs_py.errors import BuildlocError
+
+if TYPE_CHECKING:
+    from buildloc_msgs_py.pairing import FrameFault
+    from buildloc_msgs_py.types import Frame
 
 Run = Callable[[argparse.Namespace], int]
 EXTENSIONS = "buildloc.commands"
@@ -44,6 +48,26 @@ def _progress(text: str) -> None:
 
 def _progress_end() -> None:
     _progress("")
+
+
+def _frames(bag: Path) -> Iterator[Frame | FrameFault]:
+    """The images of a bag in order. Those that cannot be used are one warning; an error when all are."""
+    from buildloc_msgs_py.pairing import FrameFault
+
+    from buildloc.bag import read_frames
+
+    images, faults = 0, list[FrameFault]()
+    for frame in read_frames(bag):
+        images += 1
+        if isinstance(frame, FrameFault):
+            faults.append(frame)
+        yield frame
+    _progress_end()
+    if faults and len(faults) == images:
+        raise BuildlocError(f"{bag}: none of {images} images can be used: {faults[0].reason}")
+    if faults:
+        first = f"the first: {faults[0].reason}"
+        print(f"warning: {len(faults)} of {images} images cannot be used; {first}", file=sys.stderr)
 
 
 def _refdb_build(args: argparse.Namespace) -> int:
@@ -100,15 +124,13 @@ def _segment(args: argparse.Namespace) -> int:
     from buildloc_segmenter.config import SegmenterConfig
     from buildloc_segmenter.segmenter import Segmenter
 
-    from buildloc.bag import read_frames
     from buildloc.settings import SEGMENTER, config_of, load
 
     segmenter = Segmenter(config_of(load(args.config, args.overrides), SEGMENTER, SegmenterConfig))
     frames = faults = keyframes = 0
-    for frame in read_frames(args.bag):
+    for frame in _frames(args.bag):
         if isinstance(frame, FrameFault):
             faults += 1
-            print(f"warning: frame {frame.stamp_ns}: {frame.reason}", file=sys.stderr)
             continue
         if frames == 0:
             _empty_folder(args.out)
@@ -118,9 +140,6 @@ def _segment(args: argparse.Namespace) -> int:
             keyframes += 1
             cv2.imwrite(str(args.out / f"{mask.stamp_ns}.png"), mask.pixels)
             _progress(f"{frames} frames, {keyframes} keyframes")
-    _progress_end()
-    if frames == 0:
-        raise BuildlocError(f"{args.bag}: none of {faults} images can be used; see the warnings above")
     print(f"{args.out}: {keyframes} masks of {frames} frames, {faults} frames unusable")
     return 0
 
@@ -132,7 +151,6 @@ def _map(args: argparse.Namespace) -> int:
     from buildloc_segmenter.config import SegmenterConfig
     from buildloc_segmenter.segmenter import Segmenter
 
-    from buildloc.bag import read_frames
     from buildloc.mapfile import write_map, write_tum
     from buildloc.settings import MAPPER, SEGMENTER, config_of, load
 
@@ -140,17 +158,15 @@ def _map(args: argparse.Namespace) -> int:
     segmenter = Segmenter(config_of(settings, SEGMENTER, SegmenterConfig))
     mapper = Mapper(config_of(settings, MAPPER, MapperConfig))
     update = None
-    for frame in read_frames(args.bag):
+    for frame in _frames(args.bag):
         if isinstance(frame, FrameFault):
-            print(f"warning: frame {frame.stamp_ns}: {frame.reason}", file=sys.stderr)
             continue
         mask = segmenter.process(frame)
         update = (mapper.add(frame, mask) if mask is not None else None) or update
         if update is not None:
             _progress(f"{len(update.keyframes)} keyframes, {len(update.local_map)} buildings")
-    _progress_end()
     if update is None:
-        raise BuildlocError(f"{args.bag}: gave no map; see the warnings above")
+        raise BuildlocError(f"{args.bag}: gave no map; no keyframe could be added")
     write_map(update.outlines, update.local_map, args.out)
     print(f"{args.out}: {len(update.local_map)} buildings from {len(update.keyframes)} keyframes")
     if args.trajectory is not None:
@@ -210,7 +226,6 @@ def _run(args: argparse.Namespace) -> int:
     from buildloc_msgs_py.types import Fix, NoFix
     from buildloc_segmenter.config import SegmenterConfig
 
-    from buildloc.bag import read_frames
     from buildloc.localizer import Localizer
     from buildloc.records import record
     from buildloc.settings import MAPPER, MATCHER, SEGMENTER, config_of, load
@@ -222,19 +237,14 @@ def _run(args: argparse.Namespace) -> int:
         config_of(settings, MAPPER, MapperConfig), matcher_config,
     )  # fmt: skip
     results: list[Fix | NoFix] = []
-    usable = 0
-    for frame in read_frames(args.bag):
+    for frame in _frames(args.bag):
         if isinstance(frame, FrameFault):
-            print(f"warning: frame {frame.stamp_ns}: {frame.reason}", file=sys.stderr)
             results.append(NoFix(frame.stamp_ns, frame.reason))
-            continue
-        usable += 1
-        answer = localizer.process(frame)
-        if answer is not None:
+        elif (answer := localizer.process(frame)) is not None:
             results.append(answer.result)
-            print(describe(answer.result), flush=True)
-    if usable == 0:
-        raise BuildlocError(f"{args.bag}: no image can be used; the warnings above say why")
+        else:
+            continue
+        print(describe(results[-1]), flush=True)
     if args.out is not None:
         args.out.write_text("".join(json.dumps(record(result)) + "\n" for result in results))
     fixes = sum(isinstance(result, Fix) for result in results)
@@ -254,10 +264,12 @@ def describe(result: Any) -> str:
 
 
 def _replay(args: argparse.Namespace) -> int:
+    from buildloc_matcher.config import MatcherConfig
+    from buildloc_matcher.database import open_database
     from buildloc_msgs_py.types import Fix
 
     from buildloc.records import read_fixes
-    from buildloc.settings import NODES, REFERENCE_DB, load
+    from buildloc.settings import NODES, REFERENCE_DB, config_of, load
     from buildloc.supervisor import dds_environment
 
     os.environ.update(dds_environment())
@@ -265,6 +277,8 @@ def _replay(args: argparse.Namespace) -> int:
 
     settings = load(args.config, args.overrides)
     if args.database is not None:
+        # The node would stay up without a reference; at a desk that is a replay for nothing.
+        open_database(args.database, config_of(settings, REFERENCE_DB, MatcherConfig))
         settings[REFERENCE_DB]["database"] = str(args.database.resolve())
     for node in NODES:
         settings[node]["use_sim_time"] = True
@@ -278,8 +292,8 @@ def _replay(args: argparse.Namespace) -> int:
         print(describe(result))
     print(
         f"{len(accepted)} fixes received on /buildloc/fix; {report.images} images, {report.dropped} dropped, "
-        f"{report.frames_unusable} unusable, {report.keyframes} keyframes, {report.maps} maps, "
-        f"{report.maps_skipped} overtaken; {report.seconds:.1f} s"
+        f"{report.frames_unusable} unusable, {report.keyframes} keyframes, {report.keyframes_lost} lost, "
+        f"{report.maps} maps, {report.maps_skipped} overtaken; {report.seconds:.1f} s"
     )
     return 0
 

@@ -47,12 +47,15 @@ class ReplayError(BuildlocError):
 
 @dataclass(frozen=True)
 class ReplayReport:
-    """Images published, frames the segmenter took or refused, keyframes, maps, and maps overtaken."""
+    """Images published, frames the segmenter took or refused, keyframes masked and those lost because a node
+    was too slow, maps, and maps overtaken.
+    """
 
     images: int
     frames: int
     frames_unusable: int
     keyframes: int
+    keyframes_lost: int
     maps: int
     maps_answered: int
     maps_skipped: int
@@ -131,9 +134,11 @@ class ReplayNode(Node):  # type: ignore[misc]
 
     def report(self, images: int, seconds: float) -> ReplayReport:
         """The figures of the nodes now."""
+        lost = (self.count(SEGMENTER, key) for key in ("keyframes_dropped", "keyframes_failed"))
         return ReplayReport(
             images, self.count(SEGMENTER, "frames"), self.count(SEGMENTER, "frames_unusable"),
-            self.count(SEGMENTER, "keyframes"), self.count(MAPPER, "maps"),
+            self.count(SEGMENTER, "keyframes"), sum(lost) + self.count(MAPPER, "masks_without_image"),
+            self.count(MAPPER, "maps"),
             self.count(MATCHER, "maps_answered"), self.count(MATCHER, "maps_skipped"), seconds,
         )  # fmt: skip
 
@@ -190,6 +195,8 @@ def _drain(node: ReplayNode, images: int, alive: Callable[[], None]) -> None:
         time.sleep(POLL_S)
         if (now := node.report(images, 0.0)) != progress:
             progress, since = now, time.monotonic()
+    if not node.drained(images):
+        print(f"warning: the nodes left work undone: {progress}", file=sys.stderr)
 
 
 def replay(bag: Path, settings: Settings | None, rate: float, folder: Path, fixes: Path) -> Replay:

@@ -19,6 +19,11 @@ MODULES = {
     MATCHER: "buildloc_matcher.matcher_node",
 }
 PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
+# A node imports for seconds before ROS takes its signals: SIGINT must end it without a traceback then, too.
+START = (
+    "import runpy, signal, sys; signal.signal(signal.SIGINT, lambda *_: sys.exit(0)); "
+    "runpy.run_module(sys.argv.pop(1), run_name='__main__', alter_sys=True)"
+)
 GRACE_S = 10.0
 POLL_S = 0.1
 
@@ -41,9 +46,12 @@ class Supervisor:
     def start(self) -> None:
         """Start every node in a process group of its own, so that a terminal's SIGINT comes through us."""
         for name, module in self._modules.items():
-            command = [sys.executable, "-m", module, "--ros-args", "--params-file", str(self._parameters)]
+            arguments = [module, "--ros-args", "--params-file", str(self._parameters)]
             self._processes[name] = subprocess.Popen(
-                command, env=dds_environment(), stdin=subprocess.DEVNULL, start_new_session=True
+                [sys.executable, "-c", START, *arguments],
+                env=dds_environment(),
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,
             )
 
     def dead(self) -> dict[str, int]:

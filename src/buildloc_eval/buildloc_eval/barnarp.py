@@ -168,6 +168,18 @@ def _true_buildings(
     return np.asarray(metres[np.array(inside, dtype=bool)], dtype=np.float64)
 
 
+def fly_live(
+    case: Case, ground: Ground, database: ReferenceDatabase, database_path: Path, folder: Path, seed: int
+) -> LiveFlight:
+    """Bag and live nodes of one flight; ``folder`` takes what they write."""
+    folder.mkdir(parents=True, exist_ok=True)
+    bag = folder / "bag"
+    make_bag(case, ground, bag, seed)
+    settings = load(None, case.overrides)
+    settings[REFERENCE_DB]["database"] = str(database_path.resolve())
+    return evaluate_live(bag, database, settings, RATE, folder, f"Barnarp (real imagery): {case.title}")
+
+
 def run_case(
     case: Case,
     ground: Ground,
@@ -179,13 +191,8 @@ def run_case(
 ) -> tuple[dict[str, Any], LiveFlight]:
     """Bag, live nodes, offline scores of one flight."""
     folder = out / case.name
-    folder.mkdir(parents=True, exist_ok=True)
-    bag = folder / "bag"
-    make_bag(case, ground, bag, seed)
-    settings = load(None, case.overrides)
-    settings[REFERENCE_DB]["database"] = str(database_path.resolve())
-    live = evaluate_live(bag, database, settings, RATE, folder, f"Barnarp (real imagery): {case.title}")
-    offline = offline_scores(bag, ground, data, database, load(None, case.overrides))
+    live = fly_live(case, ground, database, database_path, folder, seed)
+    offline = offline_scores(folder / "bag", ground, data, database, load(None, case.overrides))
     accepted = [r for r in live.results if isinstance(r, Fix)]
     figures = {
         "title": case.title,

@@ -13,6 +13,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Path
 from rclpy.node import Node
 from sensor_msgs.msg import Image, PointCloud2
+from std_msgs.msg import Empty
 from std_srvs.srv import Trigger
 
 from buildloc_mapper.config import MapperConfig
@@ -36,6 +37,7 @@ class MapperNode(Node):  # type: ignore[misc]
         self._assembler = FrameAssembler(self, self._on_frame, self._diagnostics)
         self.create_subscription(Image, topics.MASK, self._on_mask, qos.SENSOR)
         self.create_service(Trigger, topics.RESET, self._on_reset)
+        self._reset_done = self.create_publisher(Empty, topics.RESET_DONE, qos.SENSOR)
 
     def _on_frame(self, frame: Frame) -> None:
         self._frames[frame.stamp_ns] = frame
@@ -56,9 +58,11 @@ class MapperNode(Node):  # type: ignore[misc]
             self._update(self._frames.pop(stamp_ns), self._masks.pop(stamp_ns))
         while len(self._frames) > FRAMES_KEPT:
             self._frames.pop(next(iter(self._frames)))
-        while len(self._masks) > FRAMES_KEPT:
-            self._masks.pop(next(iter(self._masks)))
+        newest = next(reversed(self._frames), 0)
+        for late in [mask for mask in self._masks if mask < newest]:  # images are in order: its own is gone
+            del self._masks[late]
             self._dropped += 1
+            self._report(DiagnosticStatus.WARN, "a mask came too late for its image; use a faster network")
 
     def _update(self, frame: Frame, mask: Mask) -> None:
         self._received += 1
@@ -81,8 +85,10 @@ class MapperNode(Node):  # type: ignore[misc]
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._mapper.reset()
+        self._assembler.pairing.reset()
         self._frames.clear()
         self._masks.clear()
+        self._reset_done.publish(Empty())
         self._report(DiagnosticStatus.OK, "flight forgotten")
         response.success, response.message = True, "flight forgotten; the reference is kept"
         return response

@@ -23,7 +23,7 @@ from nav_msgs.msg import Path
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image, NavSatFix, PointCloud2, Range
-from std_msgs.msg import String
+from std_msgs.msg import Empty, String
 
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.session import Job, Session
@@ -54,12 +54,13 @@ class MatcherNode(Node):  # type: ignore[misc]
             (
                 QuaternionStamped,
                 topics.GIMBAL_ATTITUDE,
-                qos.SENSOR,
+                qos.TELEMETRY,
                 partial(telemetry, topics.GIMBAL_ATTITUDE),
             ),
             (Image, topics.MASK, qos.SENSOR, partial(self._guarded, self._on_mask)),
             (PointCloud2, topics.MAP, qos.SENSOR, partial(self._guarded, self._on_map)),
             (Path, topics.KEYFRAMES, qos.SENSOR, partial(self._guarded, self._on_keyframes)),
+            (Empty, topics.RESET_DONE, qos.SENSOR, lambda _: self.session.reset()),
             (String, topics.REFERENCE_DATABASE, qos.LATCHED, self._on_database),
         ):
             self.create_subscription(kind, topic, handle, profile)
@@ -81,8 +82,7 @@ class MatcherNode(Node):  # type: ignore[misc]
         self._submit(self.session.add_keyframes(wire.decode_keyframes(message)))
 
     def _on_database(self, message: String) -> None:
-        if message.data != self.session.database_path:
-            self._worker.submit(self._load, message.data)
+        self._worker.submit(self._load, message.data)
 
     def _load(self, path: str) -> None:
         if self.session.load(path):

@@ -17,6 +17,7 @@ from buildloc_matcher.database import open_database
 from buildloc_matcher.matcher import Answer, Matcher
 
 PENDING = 10
+WAITING = "waiting for a map"
 
 
 def frames_kept(config: MatcherConfig) -> int:
@@ -42,13 +43,22 @@ class Session:
         self.matcher: Matcher | None = None
         self.database_path = ""
         self.reason = "no reference database: call /buildloc/reference/load"
-        self.latest_stamp_ns = 0
-        self.telemetry_fault = ""
         self.frames_unusable = 0
         self.maps_skipped = 0
         self._frames: dict[int, FrameObservation | None] = {}
         self._maps: dict[int, LocalMap] = {}
         self._keyframes: dict[int, tuple[Keyframe, ...]] = {}
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the flight, keep the reference."""
+        self.latest_stamp_ns = 0
+        self.telemetry_fault = ""
+        self.telemetry.reset()
+        for flown in (self._frames, self._maps, self._keyframes):
+            flown.clear()
+        if self.matcher is not None:
+            self.reason = WAITING
 
     def load(self, path: str) -> bool:
         """Open a reference database; on failure there is none, and ``reason`` says why."""
@@ -58,7 +68,7 @@ class Session:
         except (BuildlocError, OSError) as error:
             self.reason = str(error)
             return False
-        self.reason = "waiting for a map"
+        self.reason = WAITING
         return True
 
     def add_mask(self, mask: Mask) -> Job | None:

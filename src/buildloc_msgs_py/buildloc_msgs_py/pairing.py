@@ -41,6 +41,11 @@ class Series(Generic[T]):
         if len(self._stamps) > HISTORY:
             del self._values[self._stamps.pop(0)]
 
+    def clear(self) -> None:
+        """Forget all values."""
+        self._stamps.clear()
+        self._values.clear()
+
     def settled(self, stamp_ns: int) -> bool:
         """Whether no later message of an ordered topic can be nearer to ``stamp_ns``."""
         if self._max_age_ns is None:
@@ -86,13 +91,18 @@ class Telemetry:
             value = error
         series.add(wire.stamp_ns(message), value)
 
-    def settled(self, stamp_ns: int) -> bool:
-        """Whether nothing still to come can change :meth:`at` of this stamp."""
-        return all(series.settled(stamp_ns) for series, _ in self._decoders.values())
+    def unsettled(self, stamp_ns: int) -> tuple[str, ...]:
+        """Topics of which a message still to come can change :meth:`at` of this stamp."""
+        return tuple(t for t, (series, _) in self._decoders.items() if not series.settled(stamp_ns))
 
     def at(self, stamp_ns: int) -> tuple[CameraModel, float, Attitude]:
         """Camera, altitude (m) and attitude (x, y, z, w) of an image; WireError says what is missing."""
         return self.camera.at(stamp_ns), self.altitude.at(stamp_ns), self.attitude.at(stamp_ns)
+
+    def reset(self) -> None:
+        """Forget the flight. The intrinsics stay: they are the camera's, which may publish them only once."""
+        self.altitude.clear()
+        self.attitude.clear()
 
     def missing(self) -> tuple[str, ...]:
         """Topics of which nothing was received."""
@@ -118,14 +128,16 @@ class FramePairing:
     """Turns messages in the order they come into frames, in the order of the images.
 
     An image waits until telemetry at or after its stamp is there, so that live and recorded flights pair
-    the same values however their topics interleave. It goes out with what there is once it is PATIENCE_NS
-    older than the newest image, or at :meth:`flush`.
+    the same values however their topics interleave. It goes out with what there is once images of
+    PATIENCE_NS came without a message of a topic that it waits for, or at :meth:`flush`. A topic that only
+    lags is waited for: a busy node takes one message of each in turn, and telemetry comes ten to an image.
     """
 
     def __init__(self) -> None:
         self.telemetry = Telemetry()
         self._waiting: deque[_Waiting] = deque()
         self._last_stamp_ns = -1
+        self._heard_at_ns: dict[str, int] = {}  # the newest image when a topic last spoke
 
     def add(self, topic: str, message: Any) -> list[Frame | FrameFault]:
         """Take a message of any input topic; the frames, or faults, that it completes."""
@@ -137,13 +149,16 @@ class FramePairing:
                 self._last_stamp_ns = stamp
         else:
             self.telemetry.add(topic, message)
+            self._heard_at_ns[topic] = self._last_stamp_ns
         done: list[Frame | FrameFault] = []
         while self._waiting and self._due(self._waiting[0].stamp_ns):
             done.append(self._complete(self._waiting.popleft()))
         return done
 
     def _due(self, stamp_ns: int) -> bool:
-        return self.telemetry.settled(stamp_ns) or abs(self._last_stamp_ns - stamp_ns) > PATIENCE_NS
+        unsettled = self.telemetry.unsettled(stamp_ns)
+        heard = [max(stamp_ns, self._heard_at_ns.get(topic, stamp_ns)) for topic in unsettled]
+        return not heard or any(abs(self._last_stamp_ns - at_ns) > PATIENCE_NS for at_ns in heard)
 
     @property
     def waiting(self) -> int:
@@ -155,6 +170,13 @@ class FramePairing:
         done = [self._complete(waiting) for waiting in self._waiting]
         self._waiting.clear()
         return done
+
+    def reset(self) -> None:
+        """Forget the flight: waiting images and telemetry, whose stamps the next flight may have too."""
+        self.telemetry.reset()
+        self._waiting.clear()
+        self._heard_at_ns.clear()
+        self._last_stamp_ns = -1
 
     def _complete(self, waiting: _Waiting) -> Frame | FrameFault:
         try:

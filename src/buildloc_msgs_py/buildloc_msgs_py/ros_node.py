@@ -12,13 +12,12 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import QuaternionStamped
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import InvalidParameterException, InvalidParameterValueException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Range
 
 from buildloc_msgs_py import qos, topics
-from buildloc_msgs_py.config import ConfigError, from_mapping
+from buildloc_msgs_py.config import from_mapping
 from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.pairing import FrameFault, FramePairing
 from buildloc_msgs_py.types import Frame
@@ -49,18 +48,15 @@ def declare_config(node: Node, cls: type[ConfigT]) -> ConfigT:
     Raises ConfigError with one line naming parameter, value and range.
     """
     values: dict[str, Any] = {}
-    for field in dataclasses.fields(cls):  # type: ignore[arg-type]
+    fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+    for field in fields:
         default = list(field.default) if isinstance(field.default, tuple) else field.default
-        try:
-            value = node.declare_parameter(field.name, default, _descriptor(field)).value
-        except (InvalidParameterValueException, InvalidParameterException) as error:
-            low, high = field.metadata.get("low"), field.metadata.get("high")
-            value = getattr(error, "value", "?")
-            raise ConfigError(
-                f"parameter {field.name} = {value} is out of range [{low:g}, {high:g}]"
-            ) from error
+        value = node.declare_parameter(field.name, default, ParameterDescriptor(dynamic_typing=True)).value
         values[field.name] = list(value) if hasattr(value, "typecode") else value
-    return from_mapping(cls, values)
+    config = from_mapping(cls, values)
+    for field in fields:  # only now: rclpy would refuse a value out of range without saying which
+        node.set_descriptor(field.name, _descriptor(field))
+    return config
 
 
 class Diagnostics:

@@ -14,6 +14,7 @@ POSE = "/buildloc/pose"
 REFERENCE_LOAD = "/buildloc/reference/load"
 REFERENCE_DATABASE = "/buildloc/reference/database"
 RESET = "/buildloc/reset"
+RESET_DONE = "/buildloc/reset/done"
 DIAGNOSTICS = "/diagnostics"
 GROUND_TRUTH = "/ground_truth/pose"
 

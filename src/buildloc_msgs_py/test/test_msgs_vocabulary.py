@@ -206,6 +206,35 @@ def test_telemetry_that_stopped_is_a_fault() -> None:
     assert isinstance(fault, FrameFault) and "altitude nearest to the image is 8.0 s away" in fault.reason
 
 
+def test_images_wait_for_telemetry_that_lags_but_not_for_one_that_is_silent() -> None:
+    """A busy node takes one message of each topic in turn: images run ahead of telemetry at 10 Hz."""
+    pairing = FramePairing()
+    play(pairing, (topics.CAMERA_INFO, info(1.0)))
+    taken: list[Frame | FrameFault] = []
+    for turn in range(40):
+        stamp_s = 1.0 + turn / 10
+        telemetry = (
+            (topics.ALTITUDE, height(stamp_s, 60.0 + stamp_s)),
+            (topics.GIMBAL_ATTITUDE, attitude(stamp_s)),
+        )
+        images = ((topics.IMAGE, image(turn)),) if 1 <= turn < 9 else ()
+        taken += play(pairing, *images, *telemetry)
+    assert [f.altitude_m for f in taken if isinstance(f, Frame)] == [61.0, 62.0, 63.0, 64.0]
+    silent = [(topics.IMAGE, image(second)) for second in range(9, 13)]
+    taken = play(pairing, *silent)
+    assert [f.stamp_ns // 10**9 for f in taken if isinstance(f, FrameFault)] == [6, 7, 8]
+
+
+def test_reset_forgets_images_and_telemetry_but_not_the_intrinsics() -> None:
+    pairing = FramePairing()
+    before = [(topics.ALTITUDE, height(5.0, 90.0)), (topics.GIMBAL_ATTITUDE, attitude(5.0))]
+    play(pairing, (topics.CAMERA_INFO, info(1.0)), *before, (topics.IMAGE, image(6.0)))
+    pairing.reset()
+    assert pairing.flush() == [] and play(pairing, (topics.IMAGE, image(5.0))) == []
+    (frame,) = play(pairing, (topics.GIMBAL_ATTITUDE, attitude(5.0)), (topics.ALTITUDE, height(5.0, 70.0)))
+    assert isinstance(frame, Frame) and frame.altitude_m == 70.0
+
+
 def test_an_image_of_another_size_than_camera_info_is_a_fault() -> None:
     pairing = FramePairing()
     messages = [

@@ -19,12 +19,14 @@ from buildloc_msgs_py.types import Frame, Mask
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 from sensor_msgs.msg import Image
+from std_msgs.msg import Empty
 
 from buildloc_segmenter.config import SegmenterConfig
 from buildloc_segmenter.segmenter import Segmenter
 
 KEYFRAMES_WAITING = 8
 FINE = (DiagnosticStatus.OK, "segmenting")
+FORGOTTEN = (DiagnosticStatus.OK, "flight forgotten")
 TOO_SLOW = (
     DiagnosticStatus.WARN,
     "a keyframe was dropped, inference is slower than they come; use a faster network or provider",
@@ -46,6 +48,7 @@ class SegmenterNode(Node):  # type: ignore[misc]
         self._masks = self.create_publisher(Image, topics.MASK, qos.SENSOR)
         self._finished = self.create_guard_condition(self._on_finished)
         self._assembler = FrameAssembler(self, self._on_frame, self._diagnostics)
+        self.create_subscription(Empty, topics.RESET_DONE, self._on_reset, qos.SENSOR)
 
     def _on_frame(self, frame: Frame) -> None:
         if self._segmenter.select(frame):
@@ -80,6 +83,12 @@ class SegmenterNode(Node):  # type: ignore[misc]
                 self._failed += 1
                 name = "" if isinstance(error, BuildlocError) else f"{type(error).__name__}: "
                 self._state = (DiagnosticStatus.ERROR, f"segmentation failed: {name}{error}")
+        self._report()
+
+    def _on_reset(self, message: Empty) -> None:
+        self._segmenter.reset()
+        self._assembler.pairing.reset()
+        self._state = FORGOTTEN
         self._report()
 
     def _report(self) -> None:
