@@ -1,0 +1,1 @@
+"""Reference data: where building footprints come from and what becomes of them."""
