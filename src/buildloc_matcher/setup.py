@@ -27,6 +27,10 @@ setup(
         "geopandas>=1.0,<2",
         "pandas>=2.2,<4",
         "pyarrow>=14,<30",
+        "requests>=2.31,<3",
+        "urllib3>=2.0,<3",
+        "mercantile>=1.2,<2",
+        "overturemaps>=1.0.2,<2",
     ],
     extras_require={"ros": ["buildloc_msgs_py[ros]"], "test": ["pytest"]},
     entry_points={

@@ -7,6 +7,7 @@ import importlib.metadata
 import json
 import math
 import os
+import shlex
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -68,6 +69,40 @@ def _frames(bag: Path) -> Iterator[Frame | FrameFault]:
     if faults:
         first = f"the first: {faults[0].reason}"
         print(f"warning: {len(faults)} of {images} images cannot be used; {first}", file=sys.stderr)
+
+
+def _refdb_fetch(args: argparse.Namespace) -> int:
+    from buildloc_matcher.reference.download import HttpConfig
+    from buildloc_matcher.reference.fetch import (
+        MICROSOFT_INDEX,
+        Area,
+        OvertureMaps,
+        fetch_microsoft,
+        fetch_overture,
+    )
+
+    latitude_deg, longitude_deg = args.center
+    area = Area(latitude_deg, longitude_deg, args.radius_km)
+    if args.source == "overture":
+        if args.index_url is not None:
+            raise BuildlocError("--index-url is for --source microsoft; leave it out")
+        files = fetch_overture(area, args.out, OvertureMaps(), _progress)
+    else:
+        files = fetch_microsoft(area, args.out, args.index_url or MICROSOFT_INDEX, HttpConfig(), _progress)
+    _progress_end()
+    for file in files:
+        if file.doubt is not None:
+            print(f"warning: {file.path}: {file.doubt}", file=sys.stderr)
+        print(f"{file.path}  {file.size / 1e6:.1f} MB  {'fetched' if file.fresh else 'unchanged'}")
+    for licence in sorted({file.licence for file in files}):
+        print(f"licence: {licence}")
+    build = [
+        "buildloc", "refdb", "build", *(str(file.path) for file in files),
+        f"--center={latitude_deg},{longitude_deg}", "--radius-km", f"{args.radius_km:g}",
+        "--out", str(args.out / "reference.bldb"),
+    ]  # fmt: skip
+    print(f"next: {shlex.join(build)}")
+    return 0
 
 
 def _refdb_build(args: argparse.Namespace) -> int:
@@ -334,6 +369,17 @@ def parser() -> argparse.ArgumentParser:
     refdb_commands = refdb.add_subparsers(dest="refdb_command", required=True)
     bag = _argument("bag", type=Path, help="rosbag2 folder or MCAP file")
     database = _argument("--database", type=Path, required=True, help="reference database")
+    _command(
+        refdb_commands, "fetch", "download the building footprints of an area", _refdb_fetch,
+        _argument("--source", choices=("microsoft", "overture"), required=True, help="whose footprints"),
+        _argument(
+            "--center", type=_location, required=True, metavar="LAT,LON",
+            help="middle of the area; in the south write --center=-33.9,151.2",
+        ),
+        _argument("--radius-km", type=float, required=True, help="how far around the centre, km"),
+        _argument("--out", type=Path, required=True, help="folder for the files and their manifest"),
+        _argument("--index-url", help="Microsoft's dataset-links.csv, if it has moved or is mirrored"),
+    )  # fmt: skip
     with_settings = [
         _command(
             refdb_commands, "build", "describe building footprints", _refdb_build,
