@@ -21,8 +21,9 @@ from scipy.spatial import cKDTree
 
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.descriptors import DESCRIPTOR_VERSION, STAR_FEATURES, Stars, stars
-from buildloc_matcher.ingest import WGS84, ingest
 from buildloc_matcher.matching import StarIndex, index_stars
+from buildloc_matcher.reference.ingest import read_buildings
+from buildloc_matcher.reference.region import WGS84, Circle
 
 FORMAT = "buildloc-reference"
 FORMAT_VERSION = 1
@@ -107,8 +108,11 @@ def build(
     radius_km: float | None = None,
 ) -> ReferenceDatabase:
     """Read footprints and describe them; ``center_deg`` is (latitude, longitude)."""
-    found = ingest(sources, config.min_area_m2, center_deg, radius_km)
-    return assemble(found.epsg, found.centroids_m, found.areas_m2, found.shapes, config)
+    region = None if center_deg is None or radius_km is None else Circle(*center_deg, radius_km)
+    found = read_buildings(sources, config.min_area_m2, region)
+    buildings = found.buildings
+    areas_m2, shapes = buildings.areas_m2.astype(np.float64), buildings.shapes.astype(np.float64)
+    return assemble(found.epsg, buildings.centroids_m, areas_m2, shapes, config)
 
 
 def save(database: ReferenceDatabase, path: Path) -> None:
