@@ -25,14 +25,21 @@ setup(
         "shapely>=2.0,<3",
         "pyproj>=3.6,<4",
         "geopandas>=1.0,<2",
-        "pandas>=2.2,<4",
+        "pyogrio>=0.10,<1",
         "pyarrow>=14,<30",
+        "numba>=0.60,<0.70",
         "requests>=2.31,<3",
         "urllib3>=2.0,<3",
         "mercantile>=1.2,<2",
         "overturemaps>=1.0.2,<2",
+        "dask>=2024.8,<2027",
+        "distributed>=2024.8,<2027",
     ],
-    extras_require={"ros": ["buildloc_msgs_py[ros]"], "test": ["pytest"]},
+    extras_require={
+        "ros": ["buildloc_msgs_py[ros]"],
+        "dashboard": ["bokeh>=3.1,<4"],  # pages for the Dask dashboard of a build
+        "test": ["pytest"],
+    },
     entry_points={
         "console_scripts": [
             "matcher_node = buildloc_matcher.matcher_node:main",

@@ -34,6 +34,14 @@ def _location(text: str) -> tuple[float, float]:
     return latitude, longitude
 
 
+def _box(text: str) -> tuple[float, ...]:
+    try:
+        west, south, east, north = (float(v) for v in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not WEST,SOUTH,EAST,NORTH") from None
+    return west, south, east, north
+
+
 def _settings_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, help="YAML of ROS parameters")
     parser.add_argument(
@@ -107,21 +115,24 @@ def _refdb_fetch(args: argparse.Namespace) -> int:
 
 def _refdb_build(args: argparse.Namespace) -> int:
     from buildloc_matcher.config import MatcherConfig
-    from buildloc_matcher.database import assemble, save
-    from buildloc_matcher.ingest import ingest
+    from buildloc_matcher.reference.build import build
+    from buildloc_matcher.reference.region import Box, Circle, Region
 
     from buildloc.settings import REFERENCE_DB, config_of, load
 
+    if (args.center is None) != (args.radius_km is None) or (args.center and args.bbox):
+        raise BuildlocError("give --center and --radius-km together, or --bbox, or neither for all")
+    region: Region | None = Box(*args.bbox) if args.bbox else None
+    if args.center:
+        latitude, longitude = args.center
+        region = Circle(latitude, longitude, args.radius_km)
     config = config_of(load(args.config, args.overrides), REFERENCE_DB, MatcherConfig)
-    _progress("reading footprints")
-    found = ingest(args.sources, config.min_area_m2, args.center, args.radius_km)
-    _progress(f"describing {len(found.areas_m2)} buildings")
-    database = assemble(found.epsg, found.centroids_m, found.areas_m2, found.shapes, config)
-    save(database, args.out)
+    report = build(
+        args.sources, args.out, config, region, tile_km=args.tile_km, licence=args.licence,
+        scheduler=args.scheduler, progress=_progress,
+    )  # fmt: skip
     _progress_end()
-    for name, count in found.counts.items():
-        print(f"{name:>14}  {count}")
-    print(f"{args.out}: {len(database)} buildings, {len(database.stars)} stars, EPSG:{database.epsg}")
+    print(f"{report.table()}\n{args.out}: {report.counts['used']} buildings, EPSG:{report.epsg}")
     return 0
 
 
@@ -383,10 +394,14 @@ def parser() -> argparse.ArgumentParser:
     with_settings = [
         _command(
             refdb_commands, "build", "describe building footprints", _refdb_build,
-            _argument("sources", type=Path, nargs="+", help="GeoJSON or GeoParquet files"),
-            _argument("--out", type=Path, required=True, help="database file to write"),
+            _argument("sources", type=Path, nargs="+", help="footprint files or folders, the best first"),
+            _argument("--out", type=Path, required=True, help="database to write"),
             _argument("--center", type=_location, metavar="LAT,LON", help="keep what lies around here"),
             _argument("--radius-km", type=float, help="how far around the centre, km"),
+            _argument("--bbox", type=_box, metavar="WEST,SOUTH,EAST,NORTH", help="keep what lies here"),
+            _argument("--tile-km", type=float, default=20.0, help="side of a tile, km (default 20)"),
+            _argument("--scheduler", metavar="ADDRESS", help="Dask scheduler; default: processes here"),
+            _argument("--licence", help="licence of the sources, where their files do not state it"),
         ),
         _command(
             refdb_commands, "info", "what a database holds", _refdb_info, _argument("database", type=Path)

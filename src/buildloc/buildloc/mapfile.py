@@ -10,9 +10,10 @@ from pathlib import Path
 import geopandas as gpd
 import numpy as np
 import shapely
-from buildloc_matcher.ingest import PARQUET_SUFFIXES, polygons, read_geometries
+from buildloc_matcher.reference.ingest import polygons
+from buildloc_matcher.reference.readers import PARQUET_SUFFIXES, open_file
 from buildloc_msgs_py.errors import BuildlocError
-from buildloc_msgs_py.footprint import footprint
+from buildloc_msgs_py.footprint import footprints
 from buildloc_msgs_py.types import Keyframe, LocalMap
 from shapely.geometry import Polygon
 
@@ -43,17 +44,16 @@ def read_map(path: Path) -> LocalMap:
 
     Raises IngestError or MapFileError when there is nothing to use.
     """
-    outlines, _ = polygons(read_geometries(path), str(path))
-    west, south, east, north = outlines.total_bounds
+    batches = [polygons(batch)[0] for batch in open_file(path).batches()]
+    outlines = np.concatenate([np.empty(0, dtype=object), *batches])
+    if len(outlines) == 0:
+        raise MapFileError(f"{path}: has no building polygon; give a map file with polygons")
+    west, south, east, north = shapely.total_bounds(outlines)
     if math.hypot(east - west, north - south) < 1.0:
         raise MapFileError(f"{path}: spans less than a metre; map files are in local metres, not degrees")
-    rows = []
-    for outline in outlines:
-        measured = footprint(outline)
-        rows.append((measured.x_m, measured.y_m, measured.area_m2, *measured.shape))
-    table = np.array(rows, dtype=np.float64)
-    ids = np.arange(len(table), dtype=np.int64)
-    return LocalMap(0, ids, table[:, :2], table[:, 2], table[:, 3:], np.ones_like(ids))
+    found = footprints(outlines)
+    ids = np.arange(len(outlines), dtype=np.int64)
+    return LocalMap(0, ids, found.centroids_m, found.areas_m2, found.shapes, np.ones_like(ids))
 
 
 def write_tum(keyframes: Sequence[Keyframe], path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Ingest and the database file: every bad footprint file and every bad database, one clear line each."""
+"""The database file: every bad database, one clear line each."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ import pyarrow as pa
 import pytest
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.database import DatabaseError, DatabaseMissingError, build, open_database, save
-from buildloc_matcher.ingest import IngestError, ingest
 from buildloc_matcher.matcher import Matcher
 from buildloc_msgs_py.errors import BuildlocError
-from shapely.geometry import LineString, MultiPolygon, Point, Polygon, box
+from shapely.geometry import Polygon, box
 
 CONFIG = MatcherConfig()
 UTM = 32619
@@ -46,92 +45,6 @@ def write(path: Path, geometry: list[object], crs: int | None = 4326) -> Path:
 def one_line(error: BaseException) -> str:
     assert isinstance(error, BuildlocError) and "\n" not in str(error) and str(error)
     return str(error)
-
-
-@pytest.mark.parametrize("name", ["a.geojson", "a.parquet"])
-@pytest.mark.parametrize("crs", [4326, 3857, UTM])
-def test_any_crs_gives_the_same_buildings(tmp_path: Path, name: str, crs: int) -> None:
-    found = ingest([write(tmp_path / name, houses(), crs)], 20.0)
-    assert found.epsg == UTM and found.counts["used"] == 25
-    expected = [(p.centroid.x, p.centroid.y) for p in houses()]
-    np.testing.assert_allclose(found.centroids_m, expected, atol=0.02)
-    np.testing.assert_allclose(found.areas_m2, [p.area for p in houses()], rtol=2e-3)
-
-
-def test_center_and_radius_cut_the_city(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.parquet", houses(), UTM)
-    middle = gpd.GeoSeries([Point(*ORIGIN)], crs=UTM).to_crs(4326)[0]
-    found = ingest([path], 20.0, (middle.y, middle.x), 0.1)
-    assert 1 < found.counts["used"] < 25 and found.counts["outside"] == 25 - found.counts["used"]
-    with pytest.raises(IngestError) as error:
-        ingest([path], 20.0, (10.0, 10.0), 1.0)
-    assert "no building within 1 km" in one_line(error.value)
-    with pytest.raises(IngestError) as error:
-        ingest([path], 20.0, (10.0, 10.0), -1.0)
-    assert "not positive" in one_line(error.value)
-
-
-def test_invalid_geometry_is_repaired_and_the_rest_counted(tmp_path: Path) -> None:
-    x, y = ORIGIN
-    bow_tie = Polygon([(x, y - 90), (x + 20, y - 70), (x + 20, y - 90), (x, y - 70)])
-    pair = MultiPolygon([box(x, y - 200, x + 10, y - 190), box(x + 50, y - 200, x + 60, y - 190)])
-    shed = box(x, y - 300, x + 2, y - 298)
-    geometry = [
-        *houses(),
-        bow_tie,
-        pair,
-        shed,
-        Point(x, y),
-        LineString([(x, y), (x + 5, y)]),
-        Polygon(),
-        None,
-    ]
-    found = ingest([write(tmp_path / "a.parquet", geometry, UTM)], 20.0)
-    assert found.counts == {
-        "read": 32,
-        "empty": 2,
-        "repaired": 1,
-        "not_polygon": 2,
-        "small": 1,
-        "unusable": 0,
-        "used": 25 + 2 + 2,
-    }
-
-
-@pytest.mark.parametrize(
-    "geometry", [[Point(*ORIGIN)], [LineString([ORIGIN, (0.0, 0.0)])], [Polygon()], [None]]
-)
-def test_no_polygon_at_all_is_an_error(tmp_path: Path, geometry: list[object]) -> None:
-    with pytest.raises(IngestError) as error:
-        ingest([write(tmp_path / "a.parquet", geometry, UTM)], 20.0)
-    assert "no building polygon" in one_line(error.value)
-
-
-def test_bad_footprint_files_say_what_is_wrong(tmp_path: Path) -> None:
-    cases: list[tuple[Path, str]] = [(tmp_path / "absent.geojson", "no such footprint file")]
-    (tmp_path / "garbage.geojson").write_text("not a map")
-    (tmp_path / "garbage.parquet").write_text("not a map")
-    (tmp_path / "none.geojson").write_text('{"type": "FeatureCollection", "features": []}')
-    half = write(tmp_path / "half.parquet", houses(), UTM)
-    half.write_bytes(half.read_bytes()[:-100])
-    metres = {"type": "Feature", "properties": {}, "geometry": houses()[0].__geo_interface__}
-    (tmp_path / "metres.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [metres]}))
-    cases += [
-        (tmp_path / "garbage.geojson", "not a readable"),
-        (tmp_path / "garbage.parquet", "not a readable"),
-    ]
-    cases += [(half, "not a readable"), (tmp_path / "none.geojson", "no geometry")]
-    cases += [(tmp_path / "metres.geojson", "do not fit its CRS")]
-    cases += [(write(tmp_path / "plain.parquet", houses(), None), "no coordinate reference system")]
-    for path, text in cases:
-        with pytest.raises(IngestError) as error:
-            ingest([path], 20.0)
-        assert text in one_line(error.value) and str(path) in str(error.value)
-    with pytest.raises(IngestError):
-        ingest([], 20.0)
-    with pytest.raises(IngestError) as error:
-        ingest([write(tmp_path / "small.geojson", houses())], 5000.0)
-    assert "lower min_area_m2" in one_line(error.value)
 
 
 def test_a_database_survives_the_file(tmp_path: Path) -> None:
