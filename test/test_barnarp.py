@@ -13,7 +13,8 @@ from buildloc.supervisor import dds_environment
 from buildloc_eval.barnarp import BASELINE, cases, fly_live
 from buildloc_eval.realworld import place_barnarp
 from buildloc_matcher.config import MatcherConfig
-from buildloc_matcher.database import build, save
+from buildloc_matcher.reference.build import build
+from buildloc_matcher.reference.database import open_database
 from drone import domain_id
 
 pytestmark = [
@@ -35,8 +36,8 @@ def test_the_flight_over_the_east_half_is_localized(tmp_path: Path, monkeypatch:
     for name, value in dds_environment().items():
         monkeypatch.setenv(name, value)
     ground = place_barnarp(DATA, tmp_path)
-    database = build([ground.footprints], MatcherConfig())
-    save(database, tmp_path / "reference.bldb")
+    build([ground.footprints], tmp_path / "reference.bldb", MatcherConfig())
+    database = open_database(tmp_path / "reference.bldb", MatcherConfig())
     assert len(database) >= 30_000
     case = cases(DATA)[0]
     assert case.flight.length_m >= 2000.0 and case.flight.width == 1280

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from buildloc_matcher import database
 from buildloc_matcher.config import MatcherConfig
+from buildloc_matcher.reference import database
+from buildloc_matcher.reference.build import build
 
 ORIGIN_DEG = (8.15, 47.62)
 BAD_DATABASES = {
@@ -56,12 +57,12 @@ def houses(path: Path, rows: int = 5) -> Path:
 
 
 def build_database(path: Path, footprints: Path, config: MatcherConfig | None = None) -> Path:
-    database.save(database.build([footprints], config or MatcherConfig()), path)
+    build([footprints], path, config or MatcherConfig())
     return path
 
 
 def bad_database(kind: str, path: Path, footprints: Path) -> Path:
-    """A file that the default configuration refuses, one of BAD_DATABASES."""
+    """What the default configuration refuses, one of BAD_DATABASES."""
     if kind == "missing":
         return path
     if kind == "foreign":
@@ -73,6 +74,7 @@ def bad_database(kind: str, path: Path, footprints: Path) -> Path:
         with mock.patch.object(database, "FORMAT_VERSION", database.FORMAT_VERSION + 1):
             return build_database(path, footprints)
     assert kind == "truncated"
-    whole = build_database(path, footprints).read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
+    table = next(build_database(path, footprints).glob("*.triangles.arrow"))
+    whole = table.read_bytes()
+    table.write_bytes(whole[: len(whole) // 2])
     return path

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from buildloc_msgs_py.pairing import FrameFault
     from buildloc_msgs_py.types import Frame
 
+    from buildloc.settings import Settings
+
 Run = Callable[[argparse.Namespace], int]
 EXTENSIONS = "buildloc.commands"
 
@@ -42,12 +44,30 @@ def _box(text: str) -> tuple[float, ...]:
     return west, south, east, north
 
 
+def _point(text: str) -> tuple[float, float]:
+    try:
+        x, y = (float(v) for v in text.split(","))
+    except ValueError:
+        x = y = math.nan
+    if not (math.isfinite(x) and math.isfinite(y)):
+        raise argparse.ArgumentTypeError(f"{text!r} is not X,Y in metres of the map")
+    return x, y
+
+
 def _settings_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, help="YAML of ROS parameters")
     parser.add_argument(
         "--set", action="append", default=[], metavar="NODE.PARAMETER=VALUE", dest="overrides",
         help="override one parameter, e.g. segmenter_node.model=net.onnx; repeatable",
     )  # fmt: skip
+
+
+def _settings(args: argparse.Namespace) -> Settings:
+    """The settings of a command with --config, --preset and --set, the later over the earlier."""
+    from buildloc.settings import MATCHER, load
+
+    preset = [] if args.preset is None else [f"{MATCHER}.preset={args.preset}"]
+    return load(args.config, [*preset, *args.overrides])
 
 
 def _progress(text: str) -> None:
@@ -114,11 +134,10 @@ def _refdb_fetch(args: argparse.Namespace) -> int:
 
 
 def _refdb_build(args: argparse.Namespace) -> int:
-    from buildloc_matcher.config import MatcherConfig
     from buildloc_matcher.reference.build import build
     from buildloc_matcher.reference.region import Box, Circle, Region
 
-    from buildloc.settings import REFERENCE_DB, config_of, load
+    from buildloc.settings import REFERENCE_DB, load, matcher_config_of
 
     if (args.center is None) != (args.radius_km is None) or (args.center and args.bbox):
         raise BuildlocError("give --center and --radius-km together, or --bbox, or neither for all")
@@ -126,7 +145,7 @@ def _refdb_build(args: argparse.Namespace) -> int:
     if args.center:
         latitude, longitude = args.center
         region = Circle(latitude, longitude, args.radius_km)
-    config = config_of(load(args.config, args.overrides), REFERENCE_DB, MatcherConfig)
+    config = matcher_config_of(load(args.config, args.overrides), REFERENCE_DB)
     report = build(
         args.sources, args.out, config, region, tile_km=args.tile_km, licence=args.licence,
         scheduler=args.scheduler, progress=_progress,
@@ -137,23 +156,13 @@ def _refdb_build(args: argparse.Namespace) -> int:
 
 
 def _refdb_info(args: argparse.Namespace) -> int:
-    from buildloc_matcher.config import MatcherConfig
-    from buildloc_matcher.database import open_database
+    from buildloc_matcher.reference.database import describe_database
 
-    from buildloc.settings import REFERENCE_DB, config_of, load
+    from buildloc.settings import REFERENCE_DB, load, matcher_config_of
 
-    database = open_database(
-        args.database, config_of(load(args.config, args.overrides), REFERENCE_DB, MatcherConfig)
-    )
-    west, south, east, north = database.bounds_m
-    area_km2 = (east - west) * (north - south) * 1e-6
-    print(f"buildings        {len(database)}")
-    print(f"stars            {len(database.stars)}")
-    print(f"CRS              EPSG:{database.epsg}")
-    print(f"bounds           {west:.0f} {south:.0f} {east:.0f} {north:.0f} m (west south east north)")
-    print(f"density          {len(database) / max(area_km2, 1e-6):.0f} buildings/km2 of the bounds")
-    print(f"descriptor hash  {database.descriptor_hash}")
-    print(f"file size        {args.database.stat().st_size / 1e6:.1f} MB")
+    config = matcher_config_of(load(args.config, args.overrides), REFERENCE_DB)
+    for name, value in describe_database(args.database, config):
+        print(f"{name:>20}  {value}")
     return 0
 
 
@@ -222,62 +231,33 @@ def _map(args: argparse.Namespace) -> int:
 
 
 def _locate(args: argparse.Namespace) -> int:
-    from buildloc_matcher.config import MatcherConfig
-    from buildloc_matcher.database import open_database
     from buildloc_matcher.matcher import Matcher
+    from buildloc_matcher.reference.database import open_database
 
+    from buildloc.located import locate, table
     from buildloc.mapfile import read_map
-    from buildloc.settings import MATCHER, config_of, load
+    from buildloc.settings import matcher_config_of
 
-    config = config_of(load(args.config, args.overrides), MATCHER, MatcherConfig)
-    matcher = Matcher(open_database(args.database, config), config)
-    found = matcher.locate(read_map(args.map))
-    refused = matcher.refuse(found)
-    ranked: list[dict[str, Any]] = []
-    for candidate in found.candidates:
-        latitude, longitude = matcher.database.to_wgs84(candidate.x_m, candidate.y_m)
-        ranked.append(
-            {
-                "latitude_deg": latitude, "longitude_deg": longitude,
-                "easting_m": candidate.x_m, "northing_m": candidate.y_m,
-                "yaw_deg": math.degrees(candidate.yaw_rad), "scale": candidate.scale,
-                "votes": candidate.votes, "mnn_jaccard": candidate.mnn_jaccard,
-                "acceptance": candidate.acceptance,
-            }
-        )  # fmt: skip
-    fix = ranked[0] if refused is None else None
-    if args.json:
-        answer = {"fix": fix, "reason": refused, "candidates": ranked, "funnel": found.funnel}
-        print(json.dumps(answer, indent=2))
-        return 0
-    print("rank  latitude    longitude    yaw_deg  scale  votes  jaccard")
-    for rank, row in enumerate(ranked, start=1):
-        print(
-            f"{rank:4d}  {row['latitude_deg']:10.6f}  {row['longitude_deg']:11.6f}  {row['yaw_deg']:7.1f}  "
-            f"{row['scale']:5.3f}  {row['votes']:5.1f}  {row['mnn_jaccard']:7.3f}"
-        )
-    place = "the middle of the map's buildings"
-    if fix is None:
-        print(f"no fix: {refused}")
-    else:
-        print(f"fix: {place} is at {fix['latitude_deg']:.6f}, {fix['longitude_deg']:.6f}")
+    config = matcher_config_of(_settings(args))
+    local_map = read_map(args.map)
+    answer = locate(Matcher(open_database(args.database, config), config), local_map, args.at, args.top)
+    print(json.dumps(answer, indent=2) if args.json else table(answer))
     return 0
 
 
 def _run(args: argparse.Namespace) -> int:
     from buildloc_mapper.config import MapperConfig
-    from buildloc_matcher.config import MatcherConfig
-    from buildloc_matcher.database import open_database
+    from buildloc_matcher.reference.database import open_database
     from buildloc_msgs_py.pairing import FrameFault
     from buildloc_msgs_py.types import Fix, NoFix
     from buildloc_segmenter.config import SegmenterConfig
 
     from buildloc.localizer import Localizer
     from buildloc.records import record
-    from buildloc.settings import MAPPER, MATCHER, SEGMENTER, config_of, load
+    from buildloc.settings import MAPPER, SEGMENTER, config_of, matcher_config_of
 
-    settings = load(args.config, args.overrides)
-    matcher_config = config_of(settings, MATCHER, MatcherConfig)
+    settings = _settings(args)
+    matcher_config = matcher_config_of(settings)
     localizer = Localizer(
         open_database(args.database, matcher_config), config_of(settings, SEGMENTER, SegmenterConfig),
         config_of(settings, MAPPER, MapperConfig), matcher_config,
@@ -310,21 +290,20 @@ def describe(result: Any) -> str:
 
 
 def _replay(args: argparse.Namespace) -> int:
-    from buildloc_matcher.config import MatcherConfig
-    from buildloc_matcher.database import open_database
+    from buildloc_matcher.reference.database import open_database
     from buildloc_msgs_py.types import Fix
 
     from buildloc.records import read_fixes
-    from buildloc.settings import NODES, REFERENCE_DB, config_of, load
+    from buildloc.settings import NODES, REFERENCE_DB, matcher_config_of
     from buildloc.supervisor import dds_environment
 
     os.environ.update(dds_environment())
     from buildloc.replay import replay
 
-    settings = load(args.config, args.overrides)
+    settings = _settings(args)
     if args.database is not None:
         # The node would stay up without a reference; at a desk that is a replay for nothing.
-        open_database(args.database, config_of(settings, REFERENCE_DB, MatcherConfig))
+        open_database(args.database, matcher_config_of(settings, REFERENCE_DB))
         settings[REFERENCE_DB]["database"] = str(args.database.resolve())
     for node in NODES:
         settings[node]["use_sim_time"] = True
@@ -345,10 +324,10 @@ def _replay(args: argparse.Namespace) -> int:
 
 
 def _launch(args: argparse.Namespace) -> int:
-    from buildloc.settings import REFERENCE_DB, load
+    from buildloc.settings import REFERENCE_DB
     from buildloc.supervisor import Supervisor, supervise
 
-    settings = load(args.config, args.overrides)
+    settings = _settings(args)
     if args.database is not None:
         settings[REFERENCE_DB]["database"] = str(args.database.resolve())
     with tempfile.TemporaryDirectory(prefix="buildloc-") as folder:
@@ -391,6 +370,7 @@ def parser() -> argparse.ArgumentParser:
         _argument("--out", type=Path, required=True, help="folder for the files and their manifest"),
         _argument("--index-url", help="Microsoft's dataset-links.csv, if it has moved or is mirrored"),
     )  # fmt: skip
+    preset = _argument("--preset", help="parameters of the matcher: default or paper")
     with_settings = [
         _command(
             refdb_commands, "build", "describe building footprints", _refdb_build,
@@ -418,11 +398,15 @@ def parser() -> argparse.ArgumentParser:
         _command(
             commands, "locate", "ranked candidates and fix of a map file", _locate,
             _argument("database", type=Path, help="reference database"),
-            _argument("map", type=Path, help="GeoJSON or GeoParquet, local metres"),
+            _argument("map", type=Path, help="building polygons in local metres, GeoJSON or GeoParquet"),
+            _argument("--at", type=_point, metavar="X,Y", help="local point to place (default: the mean)"),
+            _argument("--top", type=int, default=10, metavar="K", help="candidates listed (default 10)"),
+            preset,
             _argument("--json", action="store_true", help="machine-readable answer"),
         ),
         _command(
             commands, "run", "fixes of a bag, offline and deterministic", _run, bag, database,
+            preset,
             _argument("--out", type=Path, help="JSON lines, one per keyframe"),
         ),
         _command(
@@ -431,10 +415,12 @@ def parser() -> argparse.ArgumentParser:
             _argument("--rate", type=float, default=1.0, help="speed relative to the recording"),
             _argument("--out", type=Path, help="JSON lines of what arrived on /buildloc/fix"),
             _argument("--no-nodes", action="store_true", help="the nodes run already, elsewhere"),
+            preset,
         ),
         _command(
             commands, "launch", "start the nodes and keep them together until SIGINT", _launch,
             _argument("--database", type=Path, help="reference database"),
+            preset,
         ),
     ]  # fmt: skip
     for command in with_settings:

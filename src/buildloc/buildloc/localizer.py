@@ -5,8 +5,8 @@ from __future__ import annotations
 from buildloc_mapper.config import MapperConfig
 from buildloc_mapper.mapper import Mapper
 from buildloc_matcher.config import MatcherConfig
-from buildloc_matcher.database import ReferenceDatabase
 from buildloc_matcher.matcher import Answer, Matcher
+from buildloc_matcher.reference.database import ReferenceDatabase
 from buildloc_matcher.session import frames_kept
 from buildloc_msgs_py.ground import observe
 from buildloc_msgs_py.types import Frame, FrameObservation, NoFix

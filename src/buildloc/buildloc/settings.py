@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
+from buildloc_matcher.config import MatcherConfig, matcher_config
 from buildloc_msgs_py.config import ConfigError, from_mapping
 
 ConfigT = TypeVar("ConfigT")
@@ -59,6 +60,11 @@ def load(path: Path | None = None, overrides: Sequence[str] = ()) -> Settings:
 def config_of(settings: Settings, node: str, cls: type[ConfigT]) -> ConfigT:
     """The config dataclass of a node; raises ConfigError naming the parameter that is wrong."""
     return from_mapping(cls, {k: v for k, v in settings[node].items() if k not in NOT_CONFIG})
+
+
+def matcher_config_of(settings: Settings, node: str = MATCHER) -> MatcherConfig:
+    """The config of a node of the matcher, over the preset it names; raises ConfigError."""
+    return matcher_config({k: v for k, v in settings[node].items() if k not in NOT_CONFIG})
 
 
 def dump(settings: Settings, path: Path) -> None:

@@ -9,8 +9,6 @@ import pytest
 from buildloc.cli import main
 from shapely.geometry import box
 
-pytest.importorskip("buildloc_matcher.reference.tile", reason="the descriptors of tiles are not there yet")
-
 
 @pytest.fixture
 def town(tmp_path: Path) -> Path:

@@ -19,13 +19,14 @@ from typing import Any
 import cv2
 import numpy as np
 from buildloc.bag import read_frames
-from buildloc.settings import MAPPER, MATCHER, REFERENCE_DB, SEGMENTER, Settings, config_of, load
+from buildloc.settings import MAPPER, REFERENCE_DB, SEGMENTER, Settings, config_of, load, matcher_config_of
 from buildloc_mapper.config import MapperConfig
 from buildloc_mapper.mapper import Mapper, MapUpdate
 from buildloc_matcher.config import MatcherConfig
-from buildloc_matcher.database import ReferenceDatabase, build, save
 from buildloc_matcher.geometry import Similarity, fit_rigid
 from buildloc_matcher.matcher import Matcher
+from buildloc_matcher.reference.build import build
+from buildloc_matcher.reference.database import ReferenceDatabase, open_database
 from buildloc_msgs_py.types import ByteArray, Fix, Frame
 from buildloc_segmenter.config import SegmenterConfig
 from buildloc_segmenter.segmenter import Segmenter
@@ -46,7 +47,6 @@ WIDE = FlightConfig(length_m=2000.0, leg_m=900.0, spacing_m=80.0, speed_mps=5.0,
 BASELINE = "models/baseline_west.onnx"
 NEAR_BIN_M = 150.0  # the true 100 m bin and its eight neighbours
 FOUND_M = 5.0
-RANKED = 1000
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def offline_scores(
     labels = OrthoWorld(data / "imagery" / "barnarp" / "labels.png", ground.georef)
     segmenter = Segmenter(config_of(settings, SEGMENTER, SegmenterConfig))
     mapper = Mapper(config_of(settings, MAPPER, MapperConfig))
-    config = dataclasses.replace(config_of(settings, MATCHER, MatcherConfig), top_k=RANKED)
+    config = matcher_config_of(settings)
     counts = np.zeros(3)
     update: MapUpdate | None = None
     for frame in read_frames(bag):
@@ -148,7 +148,7 @@ def offline_scores(
         "rank_of_true_bin": ranks[0] if ranks else None,
         "candidates_ranked": len(matched.candidates),
         "best_mnn_jaccard": matched.candidates[0].mnn_jaccard if matched.candidates else None,
-        "match_seconds": matched.funnel["seconds"],
+        "match_seconds": sum(matched.seconds.values()),
     }
 
 
@@ -211,9 +211,9 @@ def evaluate(out: Path, seed: int, quick: bool) -> str:
     data = data_folder()
     out.mkdir(parents=True, exist_ok=True)
     ground = place_barnarp(data, out)
-    database = build([ground.footprints], MatcherConfig())
     database_path = out / "reference.bldb"
-    save(database, database_path)
+    build([ground.footprints], database_path, MatcherConfig())
+    database = open_database(database_path, MatcherConfig())
     results: dict[str, Any] = {}
     pictures: list[tuple[str, Path]] = []
     for case in cases(data)[: 1 if quick else 2]:

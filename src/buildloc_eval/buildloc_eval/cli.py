@@ -118,14 +118,15 @@ def run_demo(args: argparse.Namespace) -> int:
 
     os.environ.update(dds_environment())
     from buildloc_matcher.config import MatcherConfig
-    from buildloc_matcher.database import build, save
+    from buildloc_matcher.reference.build import build
+    from buildloc_matcher.reference.database import open_database
 
     from buildloc_eval.flights import evaluate_live
 
     args.out.mkdir(parents=True, exist_ok=True)
     database = args.out / "reference.bldb"
-    built = build([args.footprints], MatcherConfig())
-    save(built, database)
+    build([args.footprints], database, MatcherConfig())
+    built = open_database(database, MatcherConfig())
     print(f"reference: {len(built)} buildings of {args.footprints} -> {database}")
     settings = load()
     settings[REFERENCE_DB]["database"] = str(database.resolve())

@@ -11,7 +11,7 @@ from buildloc.records import read_fixes
 from buildloc.replay import Replay, ReplayReport, replay
 from buildloc.settings import NODES, Settings
 from buildloc_matcher.config import MatcherConfig
-from buildloc_matcher.database import ReferenceDatabase
+from buildloc_matcher.reference.database import ReferenceDatabase
 from buildloc_matcher.selection import mutual_pairs
 from buildloc_msgs_py.types import Fix, FloatArray, NoFix
 from pyproj import Transformer

@@ -129,7 +129,9 @@ def _observe_along(
     rng: np.random.Generator,
     digitiser: Digitiser,
 ) -> ObservedMap | None:
-    near = np.unique(np.concatenate(tree.query_ball_point(path[::10], HALF_SWATH_M + 10 * STEP_M))).astype(int)
+    near = np.unique(np.concatenate(tree.query_ball_point(path[::10], HALF_SWATH_M + 10 * STEP_M))).astype(
+        int
+    )
     if len(near) < count // 2:
         return None
     apart, along = cKDTree(path).query(reference.centroids_m[near])
@@ -139,7 +141,7 @@ def _observe_along(
     rows, along = near[seen], along[seen]
     # Buildings that the reference does not have, real ones and invented ones, by their share of all seen.
     extra_share = 1.0 - (1.0 - digitiser.world_only) * (1.0 - model.false)
-    extras = int(round(len(rows) * extra_share / (1.0 - extra_share)))
+    extras = round(len(rows) * extra_share / (1.0 - extra_share))
     if len(rows) + extras < count:
         return None
     true = reference.centroids_m[rows] + _offsets(len(rows), digitiser, rng)
@@ -154,7 +156,9 @@ def _observe_along(
     bent, drift = _bend(path, model, rng)
     offset = true - path[along]
     c, s = np.cos(drift[along]), np.sin(drift[along])
-    placed = bent[along] + np.column_stack([c * offset[:, 0] - s * offset[:, 1], s * offset[:, 0] + c * offset[:, 1]])
+    placed = bent[along] + np.column_stack(
+        [c * offset[:, 0] - s * offset[:, 1], s * offset[:, 0] + c * offset[:, 1]]
+    )
     placed += rng.normal(0.0, model.jitter_m, placed.shape)
     yaw, scale = rng.uniform(-math.pi, math.pi), 1.0 + rng.normal(0.0, model.scale_sigma)
     turn = scale * np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])

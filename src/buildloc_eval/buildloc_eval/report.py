@@ -12,7 +12,7 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
-from buildloc_matcher.database import ReferenceDatabase
+from buildloc_matcher.reference.database import ReferenceDatabase
 from buildloc_msgs_py.types import Fix, FloatArray, NoFix
 from matplotlib.collections import LineCollection
 from pyproj import Transformer

@@ -17,20 +17,19 @@ ROTATIONS = 36
 
 
 def lead(best: Candidate, others: Sequence[Candidate], config: MatcherConfig) -> float:
-    """Ratio of the best MNN-Jaccard to that of the best other pose; infinite without another.
+    """Evidence of the best candidate beyond that of the best other pose, nats; infinite without another.
 
     Another pose is further away than ``rival_distance_m`` or turned by more than twice the rotation
     tolerance: neighbours of the best bin are the same answer.
     """
     turned = math.radians(2.0 * config.rotation_tolerance_deg)
     rivals = [
-        c.mnn_jaccard
+        c.acceptance
         for c in others
         if math.hypot(c.x_m - best.x_m, c.y_m - best.y_m) > config.rival_distance_m
         or abs(float(wrap(c.yaw_rad - best.yaw_rad))) > turned
     ]
-    strongest = max(rivals, default=0.0)
-    return best.mnn_jaccard / strongest if strongest > 0.0 else math.inf
+    return best.acceptance - max(rivals, default=-math.inf)
 
 
 def log_odds(evidence: float, area_m2: float, config: MatcherConfig) -> float:
@@ -43,14 +42,14 @@ def log_odds(evidence: float, area_m2: float, config: MatcherConfig) -> float:
     return evidence - math.log(max(1.0, area_m2 / disc_m2) * ROTATIONS)
 
 
-def refuse_coarse(score: Score, lead_ratio: float, odds: float, config: MatcherConfig) -> str | None:
+def refuse_coarse(score: Score, lead_nats: float, odds: float, config: MatcherConfig) -> str | None:
     """Why the best candidate is not convincing, or None; ``odds`` are its log-odds."""
     if odds < config.min_log_odds:
         return f"best candidate could be chance: log-odds {odds:.1f}, below {config.min_log_odds:g}"
     if score.jaccard < config.min_jaccard:
         return f"best candidate has MNN-Jaccard {score.jaccard:.2f}, below {config.min_jaccard:g}"
-    if lead_ratio < config.min_lead:
-        return f"best candidate leads another pose only {lead_ratio:.2f} times, below {config.min_lead:g}"
+    if lead_nats < config.min_lead:
+        return f"best candidate leads another place by {lead_nats:.1f} nats, below {config.min_lead:g}"
     if len(score.pairs) < config.min_pairs:
         return f"best candidate matches {len(score.pairs)} buildings, fewer than {config.min_pairs}"
     if score.rms_m > config.max_residual_m:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
-from buildloc_msgs_py.config import ConfigError, from_mapping, param
+from buildloc_msgs_py.config import ConfigError, check, from_mapping, param
 
 VOTES = ("score", "evidence")
 SELECTIONS = ("rigid", "grow")
@@ -23,29 +23,40 @@ class MatcherConfig:
     tau_angle_deg: float = param(25.0, "filter: L1 distance of the sorted angles (Eq. 1), deg", 0.1, 180.0)
     tau_perimeter: float = param(0.2, "filter: relative perimeter difference (Eq. 1)", 0.01, 0.95)
     tau_shape: float = param(0.3, "filter: mean shape difference (Eq. 1)", 0.01, 1.0)
-    score_angle_deg: float = param(40.0, "score: angle distance that counts as none in common, deg", 0.1, 180.0)
+    score_angle_deg: float = param(
+        40.0, "score: angle distance that counts as none in common, deg", 0.1, 180.0
+    )
     score_perimeter: float = param(
         0.3, "score: relative perimeter difference that counts as none in common; 1 in Eq. 2", 0.01, 5.0
     )
-    score_area: float = param(0.45, "score: relative area difference that counts as none in common", 0.01, 5.0)
-    area_weight: float = param(3.0, "weight of the areas in the score; angles weigh 2, Eq. 2 has 0", 0.0, 10.0)
+    score_area: float = param(
+        0.45, "score: relative area difference that counts as none in common", 0.01, 5.0
+    )
+    area_weight: float = param(
+        3.0, "weight of the areas in the score; angles weigh 2, Eq. 2 has 0", 0.0, 10.0
+    )
     centre_weight: float = param(3.0, "weight of the central triangle; its neighbours weigh 1", 0.1, 10.0)
     matches_per_star: int = param(100, "best reference matches kept per query star", 1, 10000)
+    max_stars: int = param(96, "stars of a map that a first look matches, a fixed sample; 0: all", 0, 1000000)
     second_look: int = param(
-        4, "thinned triangulations tried when the first look convinces nobody; 0: none", 0, 32
+        8, "thinned triangulations added when the first look convinces nobody; 0: no second look", 0, 32
     )
+    second_look_matches: int = param(500, "matches_per_star of the second look", 1, 10000)
     scale_gate: float = param(0.15, "largest deviation of the map-to-world scale from 1", 0.0, 0.9)
     sigma_m: float = param(2.0, "error of a map building against its neighbours, per axis, m", 0.1, 50.0)
     match_share: float = param(0.7, "share of the map's buildings that the reference has", 0.05, 0.99)
-    votes: str = param("evidence", "what a hypothesis votes with: score (Eq. 3) or evidence of its surroundings")
+    votes: str = param(
+        "evidence", "what a hypothesis votes with: score (Eq. 3) or evidence of its surroundings"
+    )
     bin_size_m: float = param(100.0, "side of a voting bin, m", 1.0, 10000.0)
     rotation_tolerance_deg: float = param(
         10.0, "half width of a rotation-consistent cluster, deg", 0.1, 180.0
     )
     min_votes: int = param(1, "fewest rotation-consistent votes of a candidate", 1, 10000)
-    top_k: int = param(64, "candidates rescored", 1, 10000)
+    top_k: int = param(100, "candidates rescored", 1, 10000)
     selection: str = param(
-        "grow", "candidates are scored as rigid (Eq. 4) or grow from their best seed and follow the map's bend"
+        "grow",
+        "candidates are scored as rigid (Eq. 4) or grow from their best seed and follow the map's bend",
     )
     mnn_distance_m: float = param(10.0, "largest distance of a mutual nearest-neighbour pair, m", 0.1, 1000.0)
     observable_margin_m: float = param(
@@ -61,9 +72,14 @@ class MatcherConfig:
     min_buildings: int = param(12, "fewest buildings in the map for a fix", 3, 100000)
     min_jaccard: float = param(0.25, "smallest MNN-Jaccard of an accepted candidate", 0.0, 1.0)
     min_log_odds: float = param(
-        5.0, "smallest evidence of an accepted candidate beyond what chance gives in the reference, nats", -300.0, 1e4
+        15.0,
+        "smallest evidence of an accepted candidate beyond what chance gives in the reference, nats",
+        -300.0,
+        1e4,
     )
-    min_lead: float = param(1.3, "smallest MNN-Jaccard ratio to the best candidate elsewhere", 1.0, 100.0)
+    min_lead: float = param(
+        8.0, "smallest lead in evidence over the best candidate elsewhere, nats", 0.0, 1e4
+    )
     rival_distance_m: float = param(200.0, "candidates further away than this are elsewhere, m", 0.0, 1e6)
     min_pairs: int = param(10, "fewest distinct reference buildings matched for a fix", 3, 100000)
     max_residual_m: float = param(10.0, "largest RMS distance of the matched pairs for a fix, m", 0.1, 1000.0)
@@ -79,8 +95,8 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "paper": {
         "tau_angle_deg": 15.0, "tau_perimeter": 0.3, "tau_shape": 0.3,
         "score_angle_deg": 15.0, "score_perimeter": 1.0, "area_weight": 0.0, "centre_weight": 1.0,
-        "matches_per_star": 50, "votes": "score", "min_votes": 3, "top_k": 20, "selection": "rigid", "second_look": 0,
-        "mnn_distance_m": 10.0, "refine_distance_m": 50.0,
+        "matches_per_star": 50, "max_stars": 0, "second_look": 0, "votes": "score", "min_votes": 3,
+        "top_k": 20, "selection": "rigid", "mnn_distance_m": 10.0, "refine_distance_m": 50.0,
         "refine_last_distance_m": 15.0,
     },
 }  # fmt: skip
@@ -97,7 +113,12 @@ def matcher_config(values: Mapping[str, Any] | None = None) -> MatcherConfig:
     """The config of named values over those of ``preset`` among them. Raises ConfigError."""
     given = dict(values or {})
     base = preset_values(str(given.pop("preset", DEFAULT)))
-    config = from_mapping(MatcherConfig, base | given)
+    return check_matcher(from_mapping(MatcherConfig, base | given))
+
+
+def check_matcher(config: MatcherConfig) -> MatcherConfig:
+    """The config itself. Raises ConfigError for the first value out of range or not among its choices."""
+    check(config)
     for name, value, choices in (("votes", config.votes, VOTES), ("selection", config.selection, SELECTIONS)):
         if value not in choices:
             raise ConfigError(f"parameter {name} = {value} is not one of {', '.join(choices)}")

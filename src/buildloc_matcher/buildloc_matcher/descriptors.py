@@ -90,7 +90,9 @@ def _tie_break(points_m: FloatArray) -> FloatArray:
     depends on all the other points. The shift decides it the same way in every tile.
     """
     bits = np.ascontiguousarray(points_m, dtype=np.float64).view(np.uint64)
-    mixed = bits * np.uint64(0x9E3779B97F4A7C15) ^ (bits[:, ::-1] * np.uint64(0xC2B2AE3D27D4EB4F) >> np.uint64(29))
+    mixed = bits * np.uint64(0x9E3779B97F4A7C15) ^ (
+        bits[:, ::-1] * np.uint64(0xC2B2AE3D27D4EB4F) >> np.uint64(29)
+    )
     mixed = (mixed ^ (mixed >> np.uint64(32))) * np.uint64(0xD6E8FEB86659FD93)
     return np.asarray((mixed >> np.uint64(40)) / float(1 << 24) - 0.5, dtype=np.float64) * TIE_BREAK_M
 

@@ -42,11 +42,6 @@ class Ground:
     grid: PointGrid
     density_per_m2: FloatArray
 
-    @property
-    def frame(self) -> tuple[float, float, float, int, int]:
-        """The grid's frame as compiled loops take it."""
-        return self.grid.west_m, self.grid.south_m, self.grid.cell_m, self.grid.columns, self.grid.rows
-
 
 def ground(buildings_m: FloatArray) -> Ground:
     """Buildings (N, 2) in a grid; the density is averaged over three by three cells."""
@@ -73,17 +68,15 @@ def query_map(points_m: FloatArray) -> QueryMap:
     return QueryMap(np.ascontiguousarray(points_m), np.ascontiguousarray(near[:, 1:].astype(np.int64)))
 
 
-def witnesses(points_m: FloatArray, triangles: NDArray[np.int32]) -> NDArray[np.int64]:
+def witnesses(points_m: FloatArray, triangles: NDArray[np.int64]) -> NDArray[np.int64]:
     """(S, WITNESSES) map buildings nearest to each triangle (S, 3), its corners left out; NO_MATCH pads."""
-    found = np.full((len(triangles), WITNESSES), NO_MATCH, dtype=np.int64)
     if not len(triangles):
-        return found
+        return np.empty((0, WITNESSES), dtype=np.int64)
     count = min(WITNESSES + 3, len(points_m))
     _, near = cKDTree(points_m).query(points_m[triangles].mean(axis=1), k=count)
-    for row, (around, corners) in enumerate(zip(near, triangles, strict=True)):
-        others = around[~np.isin(around, corners)][:WITNESSES]
-        found[row, : len(others)] = others
-    return found
+    own = (near[:, :, None] == triangles[:, None, :]).any(axis=2)
+    others = np.take_along_axis(np.where(own, NO_MATCH, near), np.argsort(own, axis=1, kind="stable"), axis=1)
+    return np.ascontiguousarray(others[:, :WITNESSES].astype(np.int64))
 
 
 @njit(nogil=True, cache=True, inline="always")
@@ -104,9 +97,7 @@ def _gain(squared, variance, gate, density, share):  # type: ignore[no-untyped-d
 
 
 @njit(nogil=True, cache=True)
-def _seed_evidence(
-    query, stars, corners, others, places, points, starts, frame, density, sigma, share, out
-):  # type: ignore[no-untyped-def]
+def _seed_evidence(query, stars, corners, others, places, points, starts, frame, density, sigma, share, out):  # type: ignore[no-untyped-def]
     """Evidence of hypotheses: query triangle ``corners[stars[h]]`` lies on ``places[h]`` (3, 2).
 
     The similarity of the three corners is carried outwards over the witnesses and refitted with each that
@@ -153,13 +144,14 @@ def _seed_evidence(
 
 def seed_evidence(
     query: QueryMap,
-    triangles: NDArray[np.int32],
+    triangles: NDArray[np.int64],
     stars: NDArray[np.int64],
     places_m: FloatArray,
     reference: Ground,
     config: MatcherConfig,
 ) -> FloatArray:
-    """(H,) nats for hypotheses that lay map triangle ``stars[h]`` (rows of ``triangles``) on places (H, 3, 2)."""
+    """(H,) nats for hypotheses: the map's triangle ``stars[h]``, a row of ``triangles`` (S, 3), lies on
+    places (H, 3, 2)."""
     out = np.empty(len(stars))
     others = witnesses(query.points_m, triangles)
     parts = np.array_split(np.arange(len(stars)), THREADS)
@@ -169,7 +161,7 @@ def seed_evidence(
             rows = slice(part[0], part[-1] + 1)
             _seed_evidence(
                 query.points_m, stars[rows], triangles, others, places_m[rows], reference.grid.points_m,
-                reference.grid.starts, reference.frame, reference.density_per_m2, config.sigma_m,
+                reference.grid.starts, reference.grid.frame, reference.density_per_m2, config.sigma_m,
                 config.match_share, out[rows],
             )  # fmt: skip
 
@@ -191,10 +183,6 @@ def _placed_evidence(moved, points, starts, frame, density, sigma, share):  # ty
 
 def placed_evidence(moved_m: FloatArray, reference: Ground, config: MatcherConfig) -> float:
     """Nats for a map whose buildings lie at (N, 2) in the world."""
-    grid = reference.grid
-    return float(
-        _placed_evidence(
-            moved_m, grid.points_m, grid.starts, reference.frame, reference.density_per_m2, config.sigma_m,
-            config.match_share,
-        )  # fmt: skip
-    )
+    grid, settings = reference.grid, (config.sigma_m, config.match_share)
+    where = (grid.points_m, grid.starts, reference.grid.frame, reference.density_per_m2)
+    return float(_placed_evidence(moved_m, *where, *settings))

@@ -7,7 +7,6 @@ building is looked for where its matched neighbours predict it.
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +24,6 @@ from buildloc_matcher.evidence import (
     _density,
     _gain,
 )
-from buildloc_matcher.matching import THREADS
 from buildloc_matcher.point_grid import nearest
 
 UNKNOWN = -2
@@ -33,6 +31,7 @@ HELPFUL_M = 40.0  # neighbours further away than this predict worse
 STIFFNESS_M2 = 3.0 * 60.0**2  # how much a building's turn and scale hold to those of its neighbours
 PASSES = 2
 GIVE_UP = -12.0
+TOUCHING_M = 0.01
 
 
 @dataclass(frozen=True)
@@ -82,8 +81,10 @@ def _turn(j, query, near, state, points, turn, a, b):  # type: ignore[no-untyped
 
 
 @njit(nogil=True, cache=True)
-def _grow(query, near, corners, places, a, b, points, starts, frame, density, sigma, share, state, predicted):  # type: ignore[no-untyped-def]
-    """Fill ``state`` (N,) and ``predicted`` (N, 2) from three corners that lie on ``places``; the evidence."""
+def _grow(  # type: ignore[no-untyped-def]
+    query, near, corners, places, a, b, points, starts, frame, density, sigma, share, state, predicted
+):
+    """Fill ``state`` (N,) and ``predicted`` (N, 2) from corners that lie on ``places``; the evidence."""
     count = len(query)
     turn = np.empty((count, 2))
     support = np.zeros(count)
@@ -156,38 +157,33 @@ def _grow(query, near, corners, places, a, b, points, starts, frame, density, si
 
 def grow(
     query: QueryMap,
-    corners: NDArray[np.int32],
+    corners: NDArray[np.int64],
     places_m: FloatArray,
     reference: Ground,
     config: MatcherConfig,
-) -> list[Grown]:
-    """Grow a match from each seed: map triangle ``corners`` (C, 3) on the places (C, 3, 2) of reference
-    buildings."""
-    count = len(query.points_m)
-    states = np.empty((len(corners), count), dtype=np.int64)
-    predicted = np.empty((len(corners), count, 2))
-    evidence = np.empty(len(corners))
+) -> list[tuple[int, Grown]]:
+    """Grow a match from each seed, in order: its number and the match.
+
+    A seed lays the map's triangle ``corners`` (C, 3) on the places (C, 3, 2) of reference buildings. One
+    that agrees with an earlier match is not grown again, and one that speaks against itself is left out.
+    """
     xy = query.points_m[corners]
     source, target = xy[..., 0] + 1j * xy[..., 1], places_m[..., 0] + 1j * places_m[..., 1]
     edges, moved = np.roll(source, -1, 1) - source, np.roll(target, -1, 1) - target
     turns = (np.conj(edges) * moved).sum(axis=1) / np.maximum((np.abs(edges) ** 2).sum(axis=1), 1e-9)
-
-    def work(c: int) -> None:
-        seats = np.empty(3, dtype=np.int64)
-        for k in range(3):
-            seats[k], _ = nearest(
-                reference.grid.points_m, reference.grid.starts, reference.frame, places_m[c, k, 0], places_m[c, k, 1], 0.01
-            )
-        evidence[c] = _grow(
-            query.points_m, query.neighbours, corners[c], seats, turns[c].real, turns[c].imag,
-            reference.grid.points_m, reference.grid.starts, reference.frame, reference.density_per_m2, config.sigma_m, config.match_share,
-            states[c], predicted[c],
-        )  # fmt: skip
-
-    with ThreadPoolExecutor(THREADS) as pool:
-        list(pool.map(work, range(len(corners))))
-    grown = []
-    for state, places, nats in zip(states, predicted, evidence, strict=True):
-        matched = np.where(state >= 0, reference.grid.order[np.maximum(state, 0)], NO_MATCH)
-        grown.append(Grown(matched, places, float(nats)))
+    where = (reference.grid.points_m, reference.grid.starts, reference.grid.frame)
+    settings = (reference.density_per_m2, config.sigma_m, config.match_share)
+    grown: list[tuple[int, Grown]] = []
+    for c, triangle in enumerate(corners):
+        seats = np.array([nearest(*where, x, y, TOUCHING_M)[0] for x, y in places_m[c]], dtype=np.int64)
+        rows = reference.grid.order[seats]
+        if any((match.matches[triangle] == rows).all() for _, match in grown):
+            continue
+        state = np.empty(len(query.points_m), dtype=np.int64)
+        predicted = np.empty((len(state), 2))
+        start = (triangle, seats, turns[c].real, turns[c].imag)
+        nats = _grow(query.points_m, query.neighbours, *start, *where, *settings, state, predicted)
+        if nats > 0.0:
+            matched = np.where(state >= 0, reference.grid.order[np.maximum(state, 0)], NO_MATCH)
+            grown.append((c, Grown(matched, predicted, nats)))
     return grown

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from buildloc_msgs_py.types import FloatArray
+from numba import njit
 from numpy.typing import NDArray
 
 from buildloc_matcher.config import MatcherConfig
-from buildloc_matcher.geometry import wrap
 from buildloc_matcher.matching import NOTHING, Matches
 from buildloc_matcher.reference.database import ReferenceDatabase
+
+KEPT, MIRRORED, OFF_SCALE = 0.0, 1.0, 2.0
 
 
 @dataclass(frozen=True)
@@ -40,14 +43,26 @@ class Hypotheses:
         )  # fmt: skip
 
 
-def _complex(points_m: FloatArray) -> NDArray[np.complex128]:
-    return np.asarray(points_m[..., 0] + 1j * points_m[..., 1])
-
-
-def _orientation(corners: NDArray[np.complex128]) -> FloatArray:
-    """Sign of the signed area of triangles (M, 3) of complex corners."""
-    one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    return np.asarray(np.sign((np.conj(one) * two).imag))
+@njit(nogil=True, cache=True)
+def _similarities(stars, places, corners, query, centre, gate, out):  # type: ignore[no-untyped-def]
+    """Per match: x, y of the moved centre, yaw, scale, verdict KEPT, MIRRORED or OFF_SCALE."""
+    for h in range(len(stars)):
+        q = query[corners[stars[h]]]
+        r = places[h]
+        turned = (q[1, 0] - q[0, 0]) * (q[2, 1] - q[0, 1]) - (q[1, 1] - q[0, 1]) * (q[2, 0] - q[0, 0])
+        matched = (r[1, 0] - r[0, 0]) * (r[2, 1] - r[0, 1]) - (r[1, 1] - r[0, 1]) * (r[2, 0] - r[0, 0])
+        real, imag, ours, theirs = 0.0, 0.0, 0.0, 0.0
+        for k in range(3):
+            n = (k + 1) % 3
+            x, y, u, v = q[n, 0] - q[k, 0], q[n, 1] - q[k, 1], r[n, 0] - r[k, 0], r[n, 1] - r[k, 1]
+            real, imag = real + x * u + y * v, imag + x * v - y * u
+            ours, theirs = ours + math.sqrt(x * x + y * y), theirs + math.sqrt(u * u + v * v)
+        scale, yaw = theirs / max(ours, 1e-12), math.atan2(imag, real)
+        x, y = centre[0] - q[:, 0].mean(), centre[1] - q[:, 1].mean()
+        c, s = scale * math.cos(yaw), scale * math.sin(yaw)
+        out[h, 0], out[h, 1] = r[:, 0].mean() + c * x - s * y, r[:, 1].mean() + s * x + c * y
+        out[h, 2], out[h, 3] = yaw, scale
+        out[h, 4] = MIRRORED if turned * matched <= 0.0 else (OFF_SCALE if abs(scale - 1.0) > gate else KEPT)
 
 
 def hypothesize(
@@ -58,30 +73,24 @@ def hypothesize(
     centre_m: FloatArray,
     config: MatcherConfig,
 ) -> Hypotheses:
-    """Similarities from matched central triangles, those of the map's stars at ``corners`` (S, 3); vertices correspond by their sorted angles.
+    """Similarities from matched central triangles; vertices correspond by their sorted angles.
 
-    Mirrored pairs are rejected. The scale is the mean of the three edge ratios weighted by the query
-    edges (short edges carry the larger relative error); outside 1 +- scale_gate it is rejected. A vote
-    weighs the star score (Eq. 3).
+    ``corners`` (S, 3) are the map's buildings at the corners of its stars. Mirrored pairs are rejected. The
+    scale is the mean of the three edge ratios weighted by the query edges (short edges carry the larger
+    relative error); outside 1 +- scale_gate it is rejected. A vote weighs the star score (Eq. 3).
     """
     stars, columns = np.nonzero(matches.reference != NOTHING)
     places = database.star_corners(matches.reference[stars, columns])
-    source, target = _complex(query_centroids_m[corners[stars]]), _complex(places)
-    direct = _orientation(source) == _orientation(target)
-    edges_source, edges_target = np.roll(source, -1, 1) - source, np.roll(target, -1, 1) - target
-    scale = np.abs(edges_target).sum(axis=1) / np.maximum(np.abs(edges_source).sum(axis=1), 1e-12)
-    yaw = np.angle((np.conj(edges_source) * edges_target).sum(axis=1))
-    on_scale = np.abs(scale - 1.0) <= config.scale_gate
-    kept = direct & on_scale
-    centre = complex(centre_m[0], centre_m[1])
-    moved = target.mean(axis=1) + scale * np.exp(1j * yaw) * (centre - source.mean(axis=1))
+    found = np.empty((len(stars), 5))
+    _similarities(stars, places, corners, query_centroids_m, centre_m, config.scale_gate, found)
+    kept = found[:, 4] == KEPT
     return Hypotheses(
         stars[kept],
         places[kept],
-        np.column_stack([moved.real, moved.imag])[kept],
-        wrap(yaw[kept]),
-        scale[kept],
+        found[kept, :2],
+        found[kept, 2],
+        found[kept, 3],
         matches.score[stars, columns][kept].astype(np.float64),
-        mirrored=int((~direct).sum()),
-        off_scale=int((direct & ~on_scale).sum()),
+        mirrored=int((found[:, 4] == MIRRORED).sum()),
+        off_scale=int((found[:, 4] == OFF_SCALE).sum()),
     )

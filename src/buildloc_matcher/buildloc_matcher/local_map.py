@@ -20,7 +20,9 @@ def check_map(local_map: LocalMap) -> None:
         ("areas", local_map.areas_m2),
         ("shape metrics", local_map.shapes),
     ):
-        bad = int((~np.isfinite(values)).reshape(len(local_map), -1).any(axis=1).sum()) if len(local_map) else 0
+        bad = (
+            int((~np.isfinite(values)).reshape(len(local_map), -1).any(axis=1).sum()) if len(local_map) else 0
+        )
         if bad:
             raise MapError(f"{bad} buildings of the map have {name} that are not numbers; repair the map")
     if len(local_map) > 1:

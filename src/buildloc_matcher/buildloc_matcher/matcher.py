@@ -6,14 +6,13 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from buildloc_msgs_py.config import check
 from buildloc_msgs_py.types import Candidate, Fix, FloatArray, FrameObservation, Keyframe, LocalMap, NoFix
 
 from buildloc_matcher.acceptance import lead, log_odds, refuse_coarse, refuse_refined
-from buildloc_matcher.config import MatcherConfig
+from buildloc_matcher.config import MatcherConfig, check_matcher
 from buildloc_matcher.evidence import QueryMap, query_map, seed_evidence
 from buildloc_matcher.geometry import Similarity
 from buildloc_matcher.hypotheses import hypothesize
@@ -49,6 +48,15 @@ class Answer:
     funnel: dict[str, float]
 
 
+@dataclass(frozen=True)
+class _Look:
+    """How a look at the map makes its stars, and the matches it remembers."""
+
+    thinnings: int
+    max_stars: int
+    cache: MatchCache
+
+
 class _Clock:
     """Adds up the seconds of named stages."""
 
@@ -69,7 +77,7 @@ class Matcher:
     """
 
     def __init__(self, database: ReferenceDatabase, config: MatcherConfig) -> None:
-        check(config)
+        check_matcher(config)
         if database.descriptor_hash != descriptor_hash(config):
             raise DatabaseError(
                 "reference database was built with another descriptor configuration; "
@@ -77,7 +85,10 @@ class Matcher:
             )
         self.database = database
         self.config = config
-        self._cache = MatchCache(database.tables, config)
+        second = replace(config, matches_per_star=config.second_look_matches)
+        self._looks = [_Look(0, config.max_stars, MatchCache(database.tables, config))]
+        if config.second_look:
+            self._looks.append(_Look(config.second_look, 0, MatchCache(database.tables, second)))
 
     def locate(self, local_map: LocalMap) -> MatchResult:
         """Ranked candidates of a map; their x, y is where the mean of the map's buildings lies.
@@ -87,41 +98,48 @@ class Matcher:
         check_map(local_map)
         config, clock = self.config, _Clock()
         large = local_map.areas_m2 >= config.min_area_m2
-        points, areas, shapes = local_map.centroids_m[large], local_map.areas_m2[large], local_map.shapes[large]
+        points, areas, shapes = (
+            local_map.centroids_m[large],
+            local_map.areas_m2[large],
+            local_map.shapes[large],
+        )
         buildings = {"buildings": len(points)}
         if len(points) < FEWEST_BUILDINGS:
             return MatchResult((), (), None, dict(buildings), clock.seconds)
         query = query_map(points)
-        for thinnings in dict.fromkeys((0, config.second_look)):
+        funnel: dict[str, float] = {}
+        for look in self._looks:
             with clock.stage("describe"):
-                found = mesh(points, areas, shapes, thinnings)
-            candidates, scores, funnel = self._look(found, query, clock)
+                found = mesh(points, areas, shapes, look.thinnings, look.max_stars)
+            candidates, scores, figures = self._look(found, look.cache, query, clock)
+            funnel = figures | {"looks": funnel.get("looks", 0) + 1}
             if funnel.get("log_odds", -math.inf) >= config.min_log_odds:
                 break
-        return MatchResult(candidates, scores, query, buildings | funnel | {"thinnings": thinnings}, clock.seconds)
+        return MatchResult(candidates, scores, query, buildings | funnel, clock.seconds)
 
     def _look(
-        self, found: Mesh, query: QueryMap, clock: _Clock
+        self, found: Mesh, cache: MatchCache, query: QueryMap, clock: _Clock
     ) -> tuple[tuple[Candidate, ...], tuple[Score, ...], dict[str, float]]:
         """Once from stars to ranked candidates."""
         config, reference = self.config, self.database.ground
         centre = query.points_m.mean(axis=0)
         with clock.stage("match"):
-            matches = self._cache.match(found.stars)
+            matches = cache.match(found.stars)
         with clock.stage("hypothesize"):
             hypotheses = hypothesize(matches, found.corners, query.points_m, self.database, centre, config)
         with clock.stage("vote"):
             voters = hypotheses
             if config.votes == "evidence":
                 seeds = (hypotheses.stars, hypotheses.places_m)
-                voters = hypotheses.weighted(seed_evidence(query, found.corners, *seeds, reference, config))
+                nats = seed_evidence(query, found.corners, *seeds, reference, config)
+                voters = hypotheses.weighted(np.where(nats > 0.0, np.exp(nats), 0.0))
             ballot = vote(voters, config)
         with clock.stage("select"):
             selected = select(ballot, voters, found.corners, query, reference, config)
             candidates = tuple(self._candidate(c, score, centre, query) for c, score in selected)
         funnel: dict[str, float] = {
             "stars": len(found.stars),
-            "stars_matched_anew": self._cache.matched_anew,
+            "stars_matched_anew": cache.matched_anew,
             "pairs_tested": matches.tested,
             "pairs_passed": matches.passed,
             "matches": len(matches),

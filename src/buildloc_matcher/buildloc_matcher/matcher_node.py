@@ -25,7 +25,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image, NavSatFix, PointCloud2, Range
 from std_msgs.msg import Empty, String
 
-from buildloc_matcher.config import MatcherConfig
+from buildloc_matcher.config import DEFAULT, MatcherConfig, check_matcher, preset_values
 from buildloc_matcher.session import Job, Session
 
 NO_FIX_PERIOD_S = 1.0
@@ -36,7 +36,8 @@ class MatcherNode(Node):  # type: ignore[misc]
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("matcher_node", **kwargs)
-        self.session = Session(declare_config(self, MatcherConfig))
+        preset = preset_values(str(self.declare_parameter("preset", DEFAULT).value))
+        self.session = Session(check_matcher(declare_config(self, MatcherConfig, preset)))
         self.diagnostics = Diagnostics(self)
         self._lock = threading.Lock()
         self._worker = ThreadPoolExecutor(1, "solve")

@@ -101,7 +101,7 @@ class StarTable:
     first: int
 
     def __len__(self) -> int:
-        return self.sketches.shape[1]
+        return int(self.sketches.shape[1])
 
 
 def star_table(
@@ -233,9 +233,20 @@ def _window(star, tau_angle, tau_perimeter):  # type: ignore[no-untyped-def]
     high2 = min(MIDDLE_CELLS - 1, int((star[0, 1] + reach) / MIDDLE_STEP) // MIDDLE_CELL_STEPS)
     log_p = np.float32(math.log(max(star[0, PERIMETER], TINY))) - PERIMETER_MIN
     reach_p = SLACK - np.float32(math.log(max(ONE - tau_perimeter, TINY)))
-    low_p = min(STEPS - 1, max(0, int(math.floor((log_p - reach_p) / PERIMETER_STEP))))
-    high_p = min(STEPS - 1, max(0, int(math.floor((log_p + reach_p) / PERIMETER_STEP))))
+    low_p = min(STEPS - 1, max(0, math.floor((log_p - reach_p) / PERIMETER_STEP)))
+    high_p = min(STEPS - 1, max(0, math.floor((log_p + reach_p) / PERIMETER_STEP)))
     return low1, high1, low2, high2, low_p, high_p
+
+
+@njit(nogil=True, cache=True)
+def _cell_distance(star, c1, c2):  # type: ignore[no-untyped-def]
+    """The least d_alpha (Eq. 1) of a star to those of a cell."""
+    wide1, wide2 = SMALL_STEP * SMALL_CELL_STEPS, MIDDLE_STEP * MIDDLE_CELL_STEPS
+    low1, low2 = c1 * wide1, c2 * wide2
+    gap1 = max(ZERO, max(low1 - star[0, 0], star[0, 0] - low1 - wide1))
+    gap2 = max(ZERO, max(low2 - star[0, 1], star[0, 1] - low2 - wide2))
+    sum_low = low1 + low2 - star[0, 0] - star[0, 1]  # the largest angle differs by as much as the sum
+    return gap1 + gap2 + max(ZERO, max(sum_low, -sum_low - wide1 - wide2)) - SLACK
 
 
 @njit(nogil=True, cache=True)
@@ -282,6 +293,8 @@ def _candidates(star, areas, settings, sketches, starts, enough):  # type: ignor
     for c1 in range(low1, high1 + 1):
         for c2 in range(low2, high2 + 1):
             at = c1 * MIDDLE_CELLS + c2
+            if _cell_distance(star, c1, c2) >= settings[0]:
+                continue
             begin = _first_not_below(sketches[2], starts[at], starts[at + 1], low_p)
             last = _first_not_below(sketches[2], begin, starts[at + 1], high_p + 1)
             tested += last - begin
@@ -311,7 +324,21 @@ def _promising(ceilings, wanted, most):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _match(stars, areas, settings, sketches, starts, features, neighbours, vertices, building_areas, first, best, scores, counts):  # type: ignore[no-untyped-def]  # noqa: E501
+def _match(  # type: ignore[no-untyped-def]
+    stars,
+    areas,
+    settings,
+    sketches,
+    starts,
+    features,
+    neighbours,
+    vertices,
+    building_areas,
+    first,
+    best,
+    scores,
+    counts,
+):
     """Improve ``best`` and ``scores`` (S, K) of query stars (S, 4, 8) with the stars of one table.
 
     A pair is skipped only when its sketch proves that it fails the filter or scores below the K-th best.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,8 +23,11 @@ class Mesh:
     stars: QueryStars
 
 
-def mesh(points_m: FloatArray, areas_m2: FloatArray, shapes: FloatArray, thinnings: int = 0) -> Mesh:
-    """Stars of buildings with centroids (N, 2) metres, areas (N,) and shape metrics (N, 4).
+def mesh(
+    points_m: FloatArray, areas_m2: FloatArray, shapes: FloatArray, thinnings: int = 0, max_stars: int = 0
+) -> Mesh:
+    """Stars of buildings with centroids (N, 2) metres, areas (N,) and shape metrics (N, 4); ``max_stars`` of
+    them at most (0: all), a sample that depends on the stars alone, so that it lasts while the map grows.
 
     A building that the reference does not have breaks every triangle around it. So each thinning leaves a
     random quarter out (the same one every time) and adds the stars whose triangle is new.
@@ -41,8 +45,9 @@ def mesh(points_m: FloatArray, areas_m2: FloatArray, shapes: FloatArray, thinnin
     everything = np.concatenate(corners)
     _, first = np.unique(np.sort(everything, axis=1), axis=0, return_index=True)
     new = np.sort(first)
-    stars = QueryStars(
-        np.concatenate([part.features for part in parts])[new],
-        np.concatenate([part.areas_m2 for part in parts])[new],
-    )
-    return Mesh(everything[new], stars)
+    features = np.concatenate([part.features for part in parts])
+    if 0 < max_stars < len(new):
+        lots = [zlib.crc32(features[row].tobytes()) for row in new]
+        new = np.sort(new[np.argsort(lots, kind="stable")[:max_stars]])
+    areas = np.concatenate([part.areas_m2 for part in parts])
+    return Mesh(everything[new], QueryStars(features[new], areas[new]))

@@ -10,6 +10,7 @@ from buildloc_msgs_py.types import FloatArray
 from numba import njit
 from numpy.typing import NDArray
 
+Frame = tuple[float, float, float, int, int]
 MIN_CELL_M = 25.0
 POINTS_PER_CELL = 0.5
 
@@ -30,6 +31,11 @@ class PointGrid:
     columns: int
     rows: int
 
+    @property
+    def frame(self) -> Frame:
+        """West, south, cell, columns, rows, as compiled loops take them."""
+        return self.west_m, self.south_m, self.cell_m, self.columns, self.rows
+
 
 def grid_points(points_m: FloatArray) -> PointGrid:
     """Sort points (N, 2), N >= 1, into cells that hold about half a point each, or are MIN_CELL_M wide."""
@@ -46,12 +52,21 @@ def grid_points(points_m: FloatArray) -> PointGrid:
     return PointGrid(ordered, order, starts, float(low[0]), float(low[1]), cell, columns, rows)
 
 
-def within(grid: PointGrid, west_m: float, south_m: float, east_m: float, north_m: float) -> NDArray[np.int64]:
+def within(
+    grid: PointGrid, west_m: float, south_m: float, east_m: float, north_m: float
+) -> NDArray[np.int64]:
     """Rows of the input of :func:`grid_points` that lie in a box, in rising order."""
-    columns = np.clip([(west_m - grid.west_m) // grid.cell_m, (east_m - grid.west_m) // grid.cell_m + 1], 0, grid.columns)
-    rows = np.clip([(south_m - grid.south_m) // grid.cell_m, (north_m - grid.south_m) // grid.cell_m + 1], 0, grid.rows)
+    columns = np.clip(
+        [(west_m - grid.west_m) // grid.cell_m, (east_m - grid.west_m) // grid.cell_m + 1], 0, grid.columns
+    )
+    rows = np.clip(
+        [(south_m - grid.south_m) // grid.cell_m, (north_m - grid.south_m) // grid.cell_m + 1], 0, grid.rows
+    )
     spans = [
-        np.arange(grid.starts[row * grid.columns + int(columns[0])], grid.starts[row * grid.columns + int(columns[1])])
+        np.arange(
+            grid.starts[row * grid.columns + int(columns[0])],
+            grid.starts[row * grid.columns + int(columns[1])],
+        )
         for row in range(int(rows[0]), int(rows[1]))
     ]
     found = np.concatenate(spans) if spans else np.empty(0, dtype=np.int64)
@@ -60,22 +75,53 @@ def within(grid: PointGrid, west_m: float, south_m: float, east_m: float, north_
     return np.sort(grid.order[found[inside]])
 
 
+def near(grid: PointGrid, around_m: FloatArray, radius_m: float) -> NDArray[np.int64]:
+    """Rows of the input of :func:`grid_points` within the radius of any of the points (M, 2), rising."""
+    places = _near(grid.points_m, grid.starts, grid.frame, np.ascontiguousarray(around_m), radius_m)
+    return np.sort(grid.order[np.unique(places)])
+
+
+@njit(nogil=True, cache=True)
+def _near(points_m, starts, frame, around_m, radius):  # type: ignore[no-untyped-def]
+    """Places of the points near each of ``around_m``, those near several of them several times."""
+    found, count = np.empty(256, np.int64), 0
+    for x, y in around_m:
+        first_column, last_column, first_row, last_row = _reach(frame, x, y, radius)
+        for row in range(first_row, last_row + 1):
+            first = row * frame[3]
+            for at in range(starts[first + first_column], starts[first + last_column + 1]):
+                if (points_m[at, 0] - x) ** 2 + (points_m[at, 1] - y) ** 2 <= radius * radius:
+                    if count == len(found):
+                        found = np.concatenate((found, np.empty_like(found)))
+                    found[count] = at
+                    count += 1
+    return found[:count]
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _reach(frame, x, y, radius):  # type: ignore[no-untyped-def]
+    """First and last column and row of the cells that a disc touches; no row where it touches none."""
+    west, south, cell, columns, rows = frame
+    first_column = max(0, math.floor((x - radius - west) / cell))
+    last_column = min(columns - 1, math.floor((x + radius - west) / cell))
+    first_row = max(0, math.floor((y - radius - south) / cell))
+    last_row = min(rows - 1, math.floor((y + radius - south) / cell))
+    if first_column > last_column:
+        last_row = first_row - 1
+    return first_column, last_column, first_row, last_row
+
+
 @njit(nogil=True, cache=True)
 def nearest(points_m, starts, frame, x, y, reach):  # type: ignore[no-untyped-def]
     """Place in ``points_m`` of the point nearest to (x, y) and its squared distance; -1 beyond ``reach``.
 
     ``frame`` is (west, south, cell, columns, rows) of the grid.
     """
-    west, south, cell, columns, rows = frame
     best, best_squared = -1, reach * reach
-    first_column = max(0, int(math.floor((x - reach - west) / cell)))
-    last_column = min(columns - 1, int(math.floor((x + reach - west) / cell)))
-    first_row = max(0, int(math.floor((y - reach - south) / cell)))
-    last_row = min(rows - 1, int(math.floor((y + reach - south) / cell)))
-    if first_column > last_column:
-        return best, best_squared
+    first_column, last_column, first_row, last_row = _reach(frame, x, y, reach)
     for row in range(first_row, last_row + 1):
-        for at in range(starts[row * columns + first_column], starts[row * columns + last_column + 1]):
+        first = row * frame[3]
+        for at in range(starts[first + first_column], starts[first + last_column + 1]):
             squared = (points_m[at, 0] - x) ** 2 + (points_m[at, 1] - y) ** 2
             if squared < best_squared:
                 best, best_squared = at, squared

@@ -16,7 +16,7 @@ from rclpy.node import Node
 from std_msgs.msg import String
 
 from buildloc_matcher.config import MatcherConfig
-from buildloc_matcher.database import DatabaseMissingError, open_database
+from buildloc_matcher.reference.database import DatabaseMissingError, open_database
 
 
 def local_path(map_url: str) -> Path:
@@ -57,7 +57,7 @@ class ReferenceDbNode(Node):  # type: ignore[misc]
             "reference database loaded",
             database=str(path),
             buildings=len(database),
-            stars=len(database.stars),
+            stars=database.stars,
             epsg=database.epsg,
         )
         return int(LoadMap.Response.RESULT_SUCCESS)

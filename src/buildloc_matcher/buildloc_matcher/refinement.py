@@ -84,26 +84,34 @@ def refine(
     if close.sum() < 3:
         return None
     matched = nearest[close]
-    buildings = len(np.unique(matched))
     rms = math.sqrt(float(np.mean(distance[close] ** 2)))
-    centre = reference_m[matched].mean(axis=0)
-    spread = float(np.mean(np.sum((reference_m[matched] - centre) ** 2, axis=1)))
-    lever = float(np.sum((position[0] - centre) ** 2))
-    variance = rms**2 / math.sqrt(buildings) * (1.0 + lever / max(spread, 1.0))
+    distinct = np.unique(matched)
     return Refined(
         position[0],
         math.atan2(math.sin(yaw), math.cos(yaw)),
         len(points),
         int(close.sum()),
-        buildings,
+        len(distinct),
         rms,
-        variance,
+        horizontal_variance(position[0], reference_m[distinct], rms, config),
     )
 
 
+def horizontal_variance(
+    position_m: FloatArray, matched_m: FloatArray, rms_m: float, config: MatcherConfig
+) -> float:
+    """Variance per axis, m2, of a position that is carried by distinct matched buildings (M, 2).
+
+    The residual variance over the square root of their number (errors of neighbours are not independent),
+    with the lever arm to the position, inflated, and never below the floor.
+    """
+    centre = matched_m.mean(axis=0)
+    spread = float(np.mean(np.sum((matched_m - centre) ** 2, axis=1)))
+    lever = float(np.sum((position_m - centre) ** 2))
+    variance = rms_m**2 / math.sqrt(len(matched_m)) * (1.0 + lever / max(spread, 1.0))
+    return max(config.sigma_floor_m**2, config.sigma_inflation**2 * variance)
+
+
 def covariance_enu(refined: Refined, config: MatcherConfig) -> FloatArray:
-    """(3, 3) m2: the residual variance over the square root of the distinct buildings (frames repeat
-    the same buildings, so residuals are not independent), with the lever arm to the camera, inflated,
-    and never below the floor. The altitude is above ground, not above the ellipsoid: wide."""
-    horizontal = max(config.sigma_floor_m**2, config.sigma_inflation**2 * refined.variance_m2)
-    return np.diag([horizontal, horizontal, config.sigma_up_m**2])
+    """(3, 3) m2, east, north, up. The altitude is above ground, not above the ellipsoid: wide."""
+    return np.diag([refined.variance_m2, refined.variance_m2, config.sigma_up_m**2])

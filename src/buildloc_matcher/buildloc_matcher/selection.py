@@ -16,9 +16,8 @@ from buildloc_matcher.evidence import Ground, QueryMap, placed_evidence
 from buildloc_matcher.geometry import Similarity, fit_similarity
 from buildloc_matcher.growth import Grown, grow
 from buildloc_matcher.hypotheses import Hypotheses
-from buildloc_matcher.point_grid import within
+from buildloc_matcher.point_grid import near
 from buildloc_matcher.voting import Ballot, Cluster
-
 
 GROWN_SCORED = 10  # distinct grown matches that get the full score
 LOCAL_M = 100.0
@@ -66,35 +65,36 @@ def mutual_pairs(query_m: FloatArray, reference_m: FloatArray, max_distance_m: f
     return np.column_stack([queries[mutual], to_reference[mutual]]).astype(np.int64)
 
 
-def observable(
-    query_m: FloatArray, reference_m: FloatArray, margin_m: float, radius_m: float
-) -> NDArray[np.int64]:
-    """Indices of the reference buildings the map should have seen: inside the hull of the map
-    buildings grown by the margin, and within the radius of one of them (a flight along an L does not
-    see the inside of its hull)."""
-    if len(query_m) == 0 or len(reference_m) == 0:
+def observable(query_m: FloatArray, reference: Ground, config: MatcherConfig) -> NDArray[np.int64]:
+    """Rows of the reference buildings the map should have seen: inside the hull of the map's buildings
+    grown by the margin, and within the radius of one of them (a flight along an L does not see the inside
+    of its hull)."""
+    if len(query_m) == 0:
         return np.empty(0, dtype=np.int64)
-    near = np.isfinite(cKDTree(query_m).query(reference_m, distance_upper_bound=radius_m)[0])
-    hull = shapely.MultiPoint(query_m).convex_hull.buffer(margin_m)
+    rows = near(reference.grid, query_m, config.observable_radius_m)
+    hull = shapely.MultiPoint(query_m).convex_hull.buffer(config.observable_margin_m)
     shapely.prepare(hull)
-    inside = shapely.contains_xy(hull, reference_m[:, 0], reference_m[:, 1])
-    return np.asarray(np.flatnonzero(near & inside), dtype=np.int64)
+    x, y = reference.buildings_m[rows].T
+    return np.asarray(rows[shapely.contains_xy(hull, x, y)], dtype=np.int64)
 
 
 def mnn_jaccard(
-    query_m: FloatArray, reference_m: FloatArray, config: MatcherConfig
+    query_m: FloatArray, reference: Ground, config: MatcherConfig
 ) -> tuple[float, NDArray[np.int64]]:
-    """J = |M| / (|Q| + |R| - |M|) and the pairs M; reference (N, 2) is cut to the observable region."""
-    seen = observable(query_m, reference_m, config.observable_margin_m, config.observable_radius_m)
-    pairs = mutual_pairs(query_m, reference_m[seen], config.mnn_distance_m)
+    """J = |M| / (|Q| + |R| - |M|) of buildings (N, 2) in the world, and the pairs M (P, 2): rows of the map
+    and of the reference. R are the reference's observable buildings."""
+    seen = observable(query_m, reference, config)
+    pairs = mutual_pairs(query_m, reference.buildings_m[seen], config.mnn_distance_m)
     union = len(query_m) + len(seen) - len(pairs)
-    if len(pairs):
-        pairs = np.column_stack([pairs[:, 0], seen[pairs[:, 1]]])
-    return (len(pairs) / union if union else 0.0), pairs
+    return (len(pairs) / union if union else 0.0), np.column_stack([pairs[:, 0], seen[pairs[:, 1]]])
 
 
 def select(
-    ballot: Ballot, voters: Hypotheses, corners: NDArray[np.int64], query: QueryMap, reference: Ground,
+    ballot: Ballot,
+    voters: Hypotheses,
+    corners: NDArray[np.int64],
+    query: QueryMap,
+    reference: Ground,
     config: MatcherConfig,
 ) -> list[tuple[Cluster, Score]]:
     """Clusters with their scores, best first: by MNN-Jaccard, or by evidence where matches grow.
@@ -106,18 +106,17 @@ def select(
         return sorted(rigid, key=lambda pair: (-pair[1].jaccard, -pair[0].votes))
     best = [cluster.best for cluster in ballot.clusters]
     grown = grow(query, corners[voters.stars[best]], voters.places_m[best], reference, config)
-    order = sorted(range(len(grown)), key=lambda c: -grown[c].evidence)
     scored: list[tuple[Cluster, Score]] = []
     places: list[FloatArray] = []
-    for c in order:
-        if grown[c].evidence <= 0.0 or len(scored) == GROWN_SCORED:
-            break
-        place = np.nanmean(grown[c].predicted_m, axis=0)
+    for c, match in sorted(grown, key=lambda found: -found[1].evidence):
+        place = np.nanmean(match.predicted_m, axis=0)
         if any(np.hypot(*(place - other)) < config.mnn_distance_m for other in places):
             continue  # grown from another seed into the same match
         places.append(place)
-        start = _start(ballot.clusters[c], query)
-        scored.append((ballot.clusters[c], score_grown(start, grown[c], query, reference, config)))
+        cluster = ballot.clusters[c]
+        scored.append((cluster, score_grown(_start(cluster, query), match, query, reference, config)))
+        if len(scored) == GROWN_SCORED:
+            break
     return scored
 
 
@@ -134,7 +133,9 @@ def score_rigid(transform: Similarity, query: QueryMap, reference: Ground, confi
     return _scored(transform, moved, placed_evidence(moved, reference, config), reference, config)
 
 
-def score_grown(start: Similarity, grown: Grown, query: QueryMap, reference: Ground, config: MatcherConfig) -> Score:
+def score_grown(
+    start: Similarity, grown: Grown, query: QueryMap, reference: Ground, config: MatcherConfig
+) -> Score:
     """A grown candidate; buildings it never reached lie where its transform puts them.
 
     ``start`` serves where fewer than three buildings matched.
@@ -152,11 +153,7 @@ def score_grown(start: Similarity, grown: Grown, query: QueryMap, reference: Gro
 def _scored(
     transform: Similarity, moved_m: FloatArray, evidence: float, reference: Ground, config: MatcherConfig
 ) -> Score:
-    margin = config.observable_margin_m + config.mnn_distance_m
-    rows = within(reference.grid, *(moved_m.min(axis=0) - margin), *(moved_m.max(axis=0) + margin))
-    local = reference.buildings_m[rows]
-    jaccard, pairs = mnn_jaccard(moved_m, local, config)
-    squared = np.sum((moved_m[pairs[:, 0]] - local[pairs[:, 1]]) ** 2, axis=1)
+    jaccard, pairs = mnn_jaccard(moved_m, reference, config)
+    squared = np.sum((moved_m[pairs[:, 0]] - reference.buildings_m[pairs[:, 1]]) ** 2, axis=1)
     rms = math.sqrt(squared.mean()) if len(pairs) else math.inf
-    pairs = np.column_stack([pairs[:, 0], rows[pairs[:, 1]]])
     return Score(transform, moved_m, pairs, rms, jaccard, evidence)

@@ -13,8 +13,8 @@ from buildloc_msgs_py.pairing import Telemetry
 from buildloc_msgs_py.types import FrameObservation, Keyframe, LocalMap, Mask, NoFix
 
 from buildloc_matcher.config import MatcherConfig
-from buildloc_matcher.database import open_database
 from buildloc_matcher.matcher import Answer, Matcher
+from buildloc_matcher.reference.database import open_database
 
 PENDING = 10
 WAITING = "waiting for a map"

@@ -62,10 +62,16 @@ def _clusters(starts, positions, yaws, scales, weights, tolerance, out):  # type
                 continue
             w = weights[i]
             x, y, scale = x + w * positions[i, 0], y + w * positions[i, 1], scale + w * scales[i]
-            c, s, votes, members = c + w * math.cos(yaws[i]), s + w * math.sin(yaws[i]), votes + w, members + 1
+            c, s, votes, members = (
+                c + w * math.cos(yaws[i]),
+                s + w * math.sin(yaws[i]),
+                votes + w,
+                members + 1,
+            )
             if best < 0 or w > weights[best]:
                 best = i
-        out[b] = (x / votes, y / votes, math.atan2(s, c), scale / votes, votes, members, best)
+        out[b, 0], out[b, 1], out[b, 2], out[b, 3] = x / votes, y / votes, math.atan2(s, c), scale / votes
+        out[b, 4], out[b, 5], out[b, 6] = votes, members, best
 
 
 def vote(hypotheses: Hypotheses, config: MatcherConfig) -> Ballot:

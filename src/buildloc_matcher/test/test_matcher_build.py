@@ -12,16 +12,14 @@ import geopandas as gpd
 import numpy as np
 import pytest
 from buildloc_matcher.config import MatcherConfig
+from buildloc_matcher.reference import build as module
+from buildloc_matcher.reference.build import BuildReport, build
 from buildloc_matcher.reference.buildings import SourceRecord
 from buildloc_matcher.reference.ingest import COUNTS, read_buildings
+from buildloc_matcher.reference.tile import Tile
 from buildloc_msgs_py.errors import BuildlocError
 from distributed import LocalCluster
 from shapely import box
-
-pytest.importorskip("buildloc_matcher.reference.tile", reason="the descriptors of tiles are not there yet")
-from buildloc_matcher.reference import build as module
-from buildloc_matcher.reference.build import BuildReport, build
-from buildloc_matcher.reference.tile import Tile
 
 CONFIG = MatcherConfig()
 UTM = 32619

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import rclpy
@@ -42,15 +42,17 @@ def _descriptor(field: Any) -> ParameterDescriptor:
     return descriptor
 
 
-def declare_config(node: Node, cls: type[ConfigT]) -> ConfigT:
+def declare_config(node: Node, cls: type[ConfigT], defaults: Mapping[str, Any] | None = None) -> ConfigT:
     """Declare every field of a config dataclass as a read-only ROS parameter and read them.
 
-    Raises ConfigError with one line naming parameter, value and range.
+    ``defaults`` stand in for those of the fields. Raises ConfigError with one line naming parameter, value
+    and range.
     """
     values: dict[str, Any] = {}
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
     for field in fields:
-        default = list(field.default) if isinstance(field.default, tuple) else field.default
+        default = (defaults or {}).get(field.name, field.default)
+        default = list(default) if isinstance(default, tuple) else default
         value = node.declare_parameter(field.name, default, ParameterDescriptor(dynamic_typing=True)).value
         values[field.name] = list(value) if hasattr(value, "typecode") else value
     config = from_mapping(cls, values)

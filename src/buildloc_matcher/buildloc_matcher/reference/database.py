@@ -69,7 +69,7 @@ class ReferenceDatabase:
     @cached_property
     def buildings(self) -> Buildings:
         """The buildings of all tiles, each once."""
-        return concatenate([tile.buildings.select(np.s_[: tile.owned]) for tile in self.tiles])
+        return concatenate([tile.buildings.select(np.arange(tile.owned)) for tile in self.tiles])
 
     @property
     def centroids_m(self) -> FloatArray:
@@ -172,7 +172,10 @@ class DatabaseWriter:
         if not tile.owned and not tile.triangles.stars:
             return
         files = {}
-        for kind, table in (("buildings", _buildings_table(tile, self._epsg)), ("triangles", _triangles_table(tile))):
+        for kind, table in (
+            ("buildings", _buildings_table(tile, self._epsg)),
+            ("triangles", _triangles_table(tile)),
+        ):
             file = self._path / f"{name}.{self._id}.{kind}.arrow"
             with pa.OSFile(str(file), "wb") as sink, pa.ipc.new_file(sink, table.schema) as writer:
                 writer.write_table(table)
@@ -184,6 +187,9 @@ class DatabaseWriter:
     def commit(self, sources: Sequence[SourceRecord], counts: Mapping[str, int]) -> None:
         """Make the tiles added so far the database, in one step. Raises DatabaseError without buildings."""
         buildings = sum(tile["owned"] for tile in self._tiles)
+        names = {file["name"] for tile in self._tiles for file in tile["files"].values()}
+        if not names <= {file.name for file in self._path.iterdir()}:
+            raise DatabaseError(f"{self._path}: another build has replaced it meanwhile; run this one again")
         if not buildings:
             raise DatabaseError(f"{self._path}: no building to store; check region and min_area_m2")
         manifest = {
@@ -265,7 +271,9 @@ def read_manifest(path: Path) -> dict[str, Any]:
     if not path.exists():
         raise DatabaseMissingError(f"{path}: no such reference database; {REBUILD}")
     if not path.is_dir() or not (path / MANIFEST).is_file():
-        raise DatabaseError(f"{path}: is not a buildloc reference database, or its build was cut off; {REBUILD}")
+        raise DatabaseError(
+            f"{path}: is not a buildloc reference database, or its build was cut off; {REBUILD}"
+        )
     try:
         manifest = json.loads((path / MANIFEST).read_text())
         foreign = manifest["format"] != FORMAT
@@ -275,7 +283,9 @@ def read_manifest(path: Path) -> dict[str, Any]:
     if foreign:
         raise DatabaseError(f"{path}: is not a buildloc reference database; {REBUILD}")
     if version != FORMAT_VERSION:
-        raise DatabaseError(f"{path}: reference database has version {version}, not {FORMAT_VERSION}; {REBUILD}")
+        raise DatabaseError(
+            f"{path}: reference database has version {version}, not {FORMAT_VERSION}; {REBUILD}"
+        )
     return dict(manifest)
 
 
@@ -328,7 +338,10 @@ def _open_tile(path: Path, entry: Mapping[str, Any]) -> Tile:
     )
     stars, owned = int(entry["stars"]), int(entry["owned"])
     triangles = Triangles(
-        _rows(mesh, "vertices", 3), _rows(mesh, "neighbours", 3), _rows(mesh, "features", TRIANGLE_FEATURES), stars
+        _rows(mesh, "vertices", 3),
+        _rows(mesh, "neighbours", 3),
+        _rows(mesh, "features", TRIANGLE_FEATURES),
+        stars,
     )
     sketches = np.stack([np.asarray(mesh.column(name).chunk(0))[:stars] for name in SKETCH_COLUMNS])
     if not (owned <= len(buildings) and stars <= len(triangles)):
@@ -347,3 +360,32 @@ def _table(file: Path, entry: Mapping[str, Any]) -> pa.Table:
 
 def _rows(table: pa.Table, name: str, width: int) -> NDArray[Any]:
     return np.asarray(table.column(name).chunk(0).values).reshape(-1, width)
+
+
+def describe_database(path: Path, config: MatcherConfig) -> list[tuple[str, str]]:
+    """All that a database says of itself, for people; opens it, so that a damaged one is refused."""
+    database, manifest = open_database(path, config), read_manifest(path)
+    west, south, east, north = database.bounds_m
+    low, high = database.to_wgs84(west, south), database.to_wgs84(east, north)
+    size = sum(file["bytes"] for tile in manifest["tiles"] for file in tile["files"].values())
+    rows = [
+        ("format", f"{manifest['format']} {manifest['version']}"),
+        ("buildings", f"{len(database):,}"),
+        ("stars", f"{database.stars:,}"),
+        ("tiles", f"{len(database.tiles)}"),
+        ("CRS", str(manifest["crs"])),
+        ("bounds", f"{west:.0f} {south:.0f} {east:.0f} {north:.0f} m (west south east north)"),
+        ("south-west", f"{low[0]:.5f}, {low[1]:.5f}"),
+        ("north-east", f"{high[0]:.5f}, {high[1]:.5f}"),
+        ("per km2 of bounds", f"{len(database) / max(database.area_m2 * 1e-6, 1e-6):.0f} buildings"),
+        ("minimum area", f"{manifest['min_area_m2']:g} m2"),
+        ("descriptor hash", str(manifest["descriptor_hash"])),
+        ("size", f"{size / 1e6:.1f} MB, {size / len(database):.0f} bytes per building; checksums agree"),
+    ]
+    rows += [(name.replace("_", " "), f"{count:,}") for name, count in manifest["counts"].items()]
+    for source in manifest["sources"]:
+        rows.append(
+            ("source", f"{source['path']}, {source['read']:,} geometries, licence: {source['licence']}")
+        )
+        rows.append(("sha256", str(source["sha256"])))
+    return rows

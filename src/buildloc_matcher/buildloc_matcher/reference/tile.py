@@ -58,7 +58,9 @@ def make_tile(buildings: Buildings, box_m: Box, config: MatcherConfig) -> Tile:
     rows = np.concatenate([np.flatnonzero(owned), np.flatnonzero(used & ~owned)])
     renumbered = np.full(len(large), -1, dtype=np.int32)
     renumbered[rows] = np.arange(len(rows), dtype=np.int32)
-    kept = Triangles(renumbered[triangles.vertices], triangles.neighbours, triangles.features, triangles.stars)
+    kept = Triangles(
+        renumbered[triangles.vertices], triangles.neighbours, triangles.features, triangles.stars
+    )
     stored = large.select(rows)
     indexed, sketches = index_triangles(kept, stored.areas_m2)
     return Tile(box_m, stored, int(owned.sum()), indexed, sketches)
