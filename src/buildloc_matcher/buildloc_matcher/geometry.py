@@ -38,7 +38,7 @@ class Similarity:
 def fit_rigid(source_m: FloatArray, target_m: FloatArray, weights: FloatArray | None = None) -> Similarity:
     """Rotation and translation minimising sum w |target - (R source + t)|^2, by SVD (Arun et al. 1987)."""
     w = np.ones(len(source_m)) if weights is None else weights
-    centre_s, centre_t = np.average(source_m, axis=0, weights=w), np.average(target_m, axis=0, weights=w)
+    centre_s, centre_t = w @ source_m / w.sum(), w @ target_m / w.sum()
     u, _, vt = np.linalg.svd((source_m - centre_s).T @ ((target_m - centre_t) * w[:, None]))
     turn = vt.T @ np.diag([1.0, np.sign(np.linalg.det(vt.T @ u.T)) or 1.0]) @ u.T
     return Similarity(

@@ -173,14 +173,13 @@ def grow(
     turns = (np.conj(edges) * moved).sum(axis=1) / np.maximum((np.abs(edges) ** 2).sum(axis=1), 1e-9)
     where = (reference.grid.points_m, reference.grid.starts, reference.grid.frame)
     settings = (reference.density_per_m2, config.sigma_m, config.match_share)
+    states = np.empty((len(corners), len(query.points_m)), dtype=np.int64)
     grown: list[tuple[int, Grown]] = []
     for c, triangle in enumerate(corners):
         seats = np.array([nearest(*where, x, y, TOUCHING_M)[0] for x, y in places_m[c]], dtype=np.int64)
-        rows = reference.grid.order[seats]
-        if any((match.matches[triangle] == rows).all() for _, match in grown):
+        if (states[: len(grown), triangle] == seats).all(axis=1).any():
             continue
-        state = np.empty(len(query.points_m), dtype=np.int64)
-        predicted = np.empty((len(state), 2))
+        state, predicted = states[len(grown)], np.empty((len(query.points_m), 2))
         start = (triangle, seats, turns[c].real, turns[c].imag)
         nats = _grow(query.points_m, query.neighbours, *start, *where, *settings, state, predicted)
         if nats > 0.0:

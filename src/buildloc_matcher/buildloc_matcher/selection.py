@@ -20,6 +20,7 @@ from buildloc_matcher.point_grid import near
 from buildloc_matcher.voting import Ballot, Cluster
 
 GROWN_SCORED = 10  # distinct grown matches that get the full score
+NEGLIGIBLE_NATS = 30.0  # a match that much less likely than the best is not listed
 LOCAL_M = 100.0
 FAR_WEIGHT = 1e-3
 
@@ -108,15 +109,16 @@ def select(
     grown = grow(query, corners[voters.stars[best]], voters.places_m[best], reference, config)
     scored: list[tuple[Cluster, Score]] = []
     places: list[FloatArray] = []
-    for c, match in sorted(grown, key=lambda found: -found[1].evidence):
+    ranked = sorted(grown, key=lambda found: -found[1].evidence)
+    for c, match in ranked:
+        if len(scored) == GROWN_SCORED or match.evidence < ranked[0][1].evidence - NEGLIGIBLE_NATS:
+            break
         place = np.nanmean(match.predicted_m, axis=0)
         if any(np.hypot(*(place - other)) < config.mnn_distance_m for other in places):
             continue  # grown from another seed into the same match
         places.append(place)
         cluster = ballot.clusters[c]
         scored.append((cluster, score_grown(_start(cluster, query), match, query, reference, config)))
-        if len(scored) == GROWN_SCORED:
-            break
     return scored
 
 

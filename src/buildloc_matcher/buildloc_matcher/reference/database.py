@@ -98,8 +98,9 @@ class ReferenceDatabase:
     def star_corners(self, stars: NDArray[np.int64]) -> FloatArray:
         """(M, 3, 2) centroids at the corners of the stars' central triangles, by their sorted angles."""
         corners = np.empty((len(stars), 3, 2))
-        for tile, table in zip(self.tiles, self.tables, strict=True):
-            own = (stars >= table.first) & (stars < table.first + len(table))
+        of_tile = np.searchsorted([table.first for table in self.tables], stars, side="right") - 1
+        for number, (tile, table) in enumerate(zip(self.tiles, self.tables, strict=True)):
+            own = np.flatnonzero(of_tile == number)
             vertices = tile.triangles.vertices[stars[own] - table.first]
             corners[own] = tile.buildings.centroids_m[vertices]
         return corners
