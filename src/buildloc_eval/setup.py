@@ -32,6 +32,8 @@ setup(
         "pandas>=2.2,<4",
         "rosbags>=0.11,<0.12",
         "matplotlib>=3.6,<4",
+        "scipy>=1.11,<2",
+        "faiss-cpu>=1.8,<2",
     ],
     extras_require={"ros": ["buildloc_msgs_py[ros]"], "test": ["pytest"]},
     entry_points={

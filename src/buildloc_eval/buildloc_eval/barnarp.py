@@ -10,9 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import platform
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +33,7 @@ from buildloc_eval.camera import photograph
 from buildloc_eval.flight import FlightConfig, fly
 from buildloc_eval.flights import LiveFlight, evaluate_live
 from buildloc_eval.html import write_report
+from buildloc_eval.machine import machine
 from buildloc_eval.realworld import Ground, data_folder, place_barnarp
 from buildloc_eval.sim import write_flight
 from buildloc_eval.truth import Truth, read_truth
@@ -224,8 +223,7 @@ def evaluate(out: Path, seed: int, quick: bool) -> str:
         "imagery": "real (orthophoto), flights simulated over it",
         "reference_buildings": len(database),
         "seed": seed,
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "machine": f"{platform.machine()}, Python {platform.python_version()}",
+        **machine(),
         "flights": results,
     }
     (out / "report.json").write_text(json.dumps(report, indent=2) + "\n")

@@ -141,10 +141,10 @@ def run_demo(args: argparse.Namespace) -> int:
 
 def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `buildloc eval`."""
-    parser.add_argument("name", choices=["barnarp"], help="which evaluation")
+    parser.add_argument("name", choices=["barnarp", "scale"], help="which evaluation")
     parser.add_argument("--out", type=Path, required=True, help="folder for report.json and report.html")
     parser.add_argument("--seed", type=int, default=1, help="seed of the flight")
-    parser.add_argument("--quick", action="store_true", help="only the flight over the east half")
+    parser.add_argument("--quick", action="store_true", help="a part of it, in less than five minutes")
 
 
 def run_eval(args: argparse.Namespace) -> int:
@@ -152,10 +152,19 @@ def run_eval(args: argparse.Namespace) -> int:
     from buildloc.supervisor import dds_environment
 
     os.environ.update(dds_environment())
-    from buildloc_eval.barnarp import evaluate
+    if args.name == "scale":
+        from buildloc_eval import scale
 
-    print(evaluate(args.out, args.seed, args.quick))
+        print(scale.evaluate(args.out, args.seed, args.quick, _stage))
+    else:
+        from buildloc_eval import barnarp
+
+        print(barnarp.evaluate(args.out, args.seed, args.quick))
     return 0
+
+
+def _stage(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
 sim_command = ("make a bag from an orthophoto or a rendered world", add_sim_arguments, run_sim)

@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Protocol
 
 import numpy as np
 
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.matching import Matches, QueryStars, StarTable, match_stars
+
+
+class StarMatcher(Protocol):
+    """Finds reference stars for those of a map; ``matched_anew`` counts the stars of the last call that were
+    not remembered."""
+
+    matched_anew: int
+
+    def match(self, stars: QueryStars) -> Matches:
+        """The best reference stars of every star."""
+
+
+MakeStarMatcher = Callable[[Sequence[StarTable], MatcherConfig], StarMatcher]
 
 
 class MatchCache:

@@ -17,7 +17,7 @@ from buildloc_matcher.evidence import QueryMap, query_map, seed_evidence
 from buildloc_matcher.geometry import Similarity
 from buildloc_matcher.hypotheses import hypothesize
 from buildloc_matcher.local_map import check_map
-from buildloc_matcher.match_cache import MatchCache
+from buildloc_matcher.match_cache import MakeStarMatcher, MatchCache, StarMatcher
 from buildloc_matcher.mesh import Mesh, mesh
 from buildloc_matcher.reference.database import DatabaseError, ReferenceDatabase, descriptor_hash
 from buildloc_matcher.refinement import covariance_enu, refine
@@ -54,7 +54,7 @@ class _Look:
 
     thinnings: int
     max_stars: int
-    cache: MatchCache
+    star_matcher: StarMatcher
 
 
 class _Clock:
@@ -71,12 +71,14 @@ class _Clock:
 
 
 class Matcher:
-    """Locates local maps in one reference database.
+    """Locates local maps in one reference database; ``star_matcher`` makes what finds candidates in it.
 
     Between calls it keeps the matches of stars only: an answer depends on the map alone.
     """
 
-    def __init__(self, database: ReferenceDatabase, config: MatcherConfig) -> None:
+    def __init__(
+        self, database: ReferenceDatabase, config: MatcherConfig, star_matcher: MakeStarMatcher = MatchCache
+    ) -> None:
         check_matcher(config)
         if database.descriptor_hash != descriptor_hash(config):
             raise DatabaseError(
@@ -86,9 +88,9 @@ class Matcher:
         self.database = database
         self.config = config
         second = replace(config, matches_per_star=config.second_look_matches)
-        self._looks = [_Look(0, config.max_stars, MatchCache(database.tables, config))]
+        self._looks = [_Look(0, config.max_stars, star_matcher(database.tables, config))]
         if config.second_look:
-            self._looks.append(_Look(config.second_look, 0, MatchCache(database.tables, second)))
+            self._looks.append(_Look(config.second_look, 0, star_matcher(database.tables, second)))
 
     def locate(self, local_map: LocalMap) -> MatchResult:
         """Ranked candidates of a map; their x, y is where the mean of the map's buildings lies.
@@ -111,20 +113,20 @@ class Matcher:
         for look in self._looks:
             with clock.stage("describe"):
                 found = mesh(points, areas, shapes, look.thinnings, look.max_stars)
-            candidates, scores, figures = self._look(found, look.cache, query, clock)
+            candidates, scores, figures = self._look(found, look.star_matcher, query, clock)
             funnel = figures | {"looks": funnel.get("looks", 0) + 1}
             if funnel.get("log_odds", -math.inf) >= config.min_log_odds:
                 break
         return MatchResult(candidates, scores, query, buildings | funnel, clock.seconds)
 
     def _look(
-        self, found: Mesh, cache: MatchCache, query: QueryMap, clock: _Clock
+        self, found: Mesh, star_matcher: StarMatcher, query: QueryMap, clock: _Clock
     ) -> tuple[tuple[Candidate, ...], tuple[Score, ...], dict[str, float]]:
         """Once from stars to ranked candidates."""
         config, reference = self.config, self.database.ground
         centre = query.points_m.mean(axis=0)
         with clock.stage("match"):
-            matches = cache.match(found.stars)
+            matches = star_matcher.match(found.stars)
         with clock.stage("hypothesize"):
             hypotheses = hypothesize(matches, found.corners, query.points_m, self.database, centre, config)
         with clock.stage("vote"):
@@ -139,7 +141,7 @@ class Matcher:
             candidates = tuple(self._candidate(c, score, centre, query) for c, score in selected)
         funnel: dict[str, float] = {
             "stars": len(found.stars),
-            "stars_matched_anew": cache.matched_anew,
+            "stars_matched_anew": star_matcher.matched_anew,
             "pairs_tested": matches.tested,
             "pairs_passed": matches.passed,
             "matches": len(matches),
