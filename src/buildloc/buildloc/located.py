@@ -44,8 +44,9 @@ def locate(matcher: Matcher, local_map: LocalMap, at_m: tuple[float, float] | No
             "lat": latitude, "lon": longitude, "yaw_deg": math.degrees(placed.yaw_rad), "scale": placed.scale,
             "covariance": [[variance, 0.0], [0.0, variance]], "score": found.candidates[0].acceptance,
         }  # fmt: skip
+    funnel = {name: value if math.isfinite(value) else None for name, value in found.funnel.items()}
     return {
-        "fix": fix, "reason": refused, "candidates": ranked, "funnel": found.funnel, "seconds": found.seconds
+        "fix": fix, "reason": refused, "candidates": ranked, "funnel": funnel, "seconds": found.seconds
     }  # fmt: skip
 
 

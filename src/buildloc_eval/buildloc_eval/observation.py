@@ -21,6 +21,7 @@ LONGEST_PATH_M = 6_000.0
 LEG_M = (250.0, 700.0)
 HALF_SWATH_M = 70.0
 STARTS_TRIED = 200
+CARRIERS = 12
 
 
 class ObservationError(BuildlocError):
@@ -70,8 +71,16 @@ class ObservedMap:
 
     @property
     def centre_m(self) -> FloatArray:
-        """(2,) true place of the mean of the map's buildings."""
-        return np.asarray(self.true_m.mean(axis=0))
+        """(2,) true place of the mean of the map's buildings, carried there by the buildings around it: in a
+        map that bends, the mean of the true places lies elsewhere."""
+        points = self.local_map.centroids_m
+        centre = points.mean(axis=0)
+        near = np.argsort(np.sum((points - centre) ** 2, axis=1))[:CARRIERS]
+        source, target = points[near] @ (1.0, 1.0j), self.true_m[near] @ (1.0, 1.0j)
+        middle, place = source.mean(), target.mean()
+        turn = np.vdot(source - middle, target - place) / np.vdot(source - middle, source - middle).real
+        moved = place + turn * (complex(centre[0], centre[1]) - middle)
+        return np.array([moved.real, moved.imag])
 
 
 def fly_path(start_m: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:

@@ -105,19 +105,18 @@ class Matcher:
             local_map.areas_m2[large],
             local_map.shapes[large],
         )
-        buildings = {"buildings": len(points)}
         if len(points) < FEWEST_BUILDINGS:
-            return MatchResult((), (), None, dict(buildings), clock.seconds)
+            return MatchResult((), (), None, {"buildings": len(points)}, clock.seconds)
         query = query_map(points)
-        funnel: dict[str, float] = {}
-        for look in self._looks:
+        for number, look in enumerate(self._looks, start=1):
             with clock.stage("describe"):
                 found = mesh(points, areas, shapes, look.thinnings, look.max_stars)
-            candidates, scores, figures = self._look(found, look.star_matcher, query, clock)
-            funnel = figures | {"looks": funnel.get("looks", 0) + 1}
-            if funnel.get("log_odds", -math.inf) >= config.min_log_odds:
+            candidates, scores, funnel = self._look(found, look.star_matcher, query, clock)
+            funnel |= {"buildings": len(points), "looks": number}
+            result = MatchResult(candidates, scores, query, funnel, clock.seconds)
+            if self.refuse(result) is None:
                 break
-        return MatchResult(candidates, scores, query, buildings | funnel, clock.seconds)
+        return result
 
     def _look(
         self, found: Mesh, star_matcher: StarMatcher, query: QueryMap, clock: _Clock
@@ -162,9 +161,10 @@ class Matcher:
         near = local_transform(score, centre, query, self.database.ground, self.config)
         place = near.apply(centre[None])[0]
         odds = log_odds(score.evidence, self.database.area_m2, self.config)
-        return Candidate(
-            float(place[0]), float(place[1]), near.yaw_rad, near.scale, cluster.votes, score.jaccard, odds
-        )
+        # Likelihoods are summed as votes and told as a logarithm.
+        votes = math.log(cluster.votes) if self.config.votes == "evidence" else cluster.votes
+        x, y = float(place[0]), float(place[1])
+        return Candidate(x, y, near.yaw_rad, near.scale, votes, score.jaccard, odds)
 
     def refuse(self, found: MatchResult) -> str | None:
         """Why the best candidate of a map is not convincing, or None."""
