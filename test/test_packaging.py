@@ -15,6 +15,7 @@ SRC = Path(__file__).parents[1] / "src"
 PACKAGES = sorted(path.parent.name for path in SRC.glob("*/package.xml"))
 DISTRIBUTIONS = {
     "cv2": "opencv-python-headless",
+    "faiss": "faiss-cpu",
     "yaml": "PyYAML",
 }  # where the name differs from the module's
 

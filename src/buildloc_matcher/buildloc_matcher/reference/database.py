@@ -331,11 +331,11 @@ def _touch(one: Sequence[float], other: Box) -> bool:
 
 def _open_tile(path: Path, entry: Mapping[str, Any]) -> Tile:
     found, mesh = (_table(path / entry["files"][kind]["name"], entry["files"][kind]) for kind in TABLES)
-    point = found.column("geometry").chunk(0)
+    point = _column(found, "geometry")
     buildings = Buildings(
         np.column_stack([np.asarray(point.field("x")), np.asarray(point.field("y"))]),
-        np.asarray(found.column("area_m2").chunk(0)),
-        np.column_stack([np.asarray(found.column(name).chunk(0)) for name in SHAPE_METRICS]),
+        np.asarray(_column(found, "area_m2")),
+        np.column_stack([np.asarray(_column(found, name)) for name in SHAPE_METRICS]),
     )
     stars, owned = int(entry["stars"]), int(entry["owned"])
     triangles = Triangles(
@@ -344,7 +344,7 @@ def _open_tile(path: Path, entry: Mapping[str, Any]) -> Tile:
         _rows(mesh, "features", TRIANGLE_FEATURES),
         stars,
     )
-    sketches = np.stack([np.asarray(mesh.column(name).chunk(0))[:stars] for name in SKETCH_COLUMNS])
+    sketches = np.stack([np.asarray(_column(mesh, name))[:stars] for name in SKETCH_COLUMNS])
     if not (owned <= len(buildings) and stars <= len(triangles)):
         raise ValueError("counts do not fit the tables")
     box = tuple(float(v) for v in entry["box_m"])
@@ -359,8 +359,14 @@ def _table(file: Path, entry: Mapping[str, Any]) -> pa.Table:
     return pa.ipc.open_file(data).read_all()
 
 
+def _column(table: pa.Table, name: str) -> pa.Array:
+    """A column as the one piece that it is in the file; an empty table has no piece at all."""
+    column = table.column(name)
+    return column.chunk(0) if column.num_chunks else pa.array([], column.type)
+
+
 def _rows(table: pa.Table, name: str, width: int) -> NDArray[Any]:
-    return np.asarray(table.column(name).chunk(0).values).reshape(-1, width)
+    return np.asarray(_column(table, name).values).reshape(-1, width)
 
 
 def describe_database(path: Path, config: MatcherConfig) -> list[tuple[str, str]]:
