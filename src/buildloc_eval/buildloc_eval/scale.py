@@ -230,7 +230,7 @@ def recall(
     largest = size == plan.sizes[-1]
     for name in ("default", *(plan.others if largest else ("paper",))):
         matcher = method(name, database)
-        matcher.locate(draw(database, tree, 60, 1, seed).local_map)  # compiled code is loaded
+        matcher.warm_up()
         everything = largest and name == "default"
         maps = plan.maps if everything else plan.maps_elsewhere
         for count in plan.buildings if everything else (60, 100):

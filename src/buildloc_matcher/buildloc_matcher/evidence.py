@@ -90,8 +90,8 @@ def _density(density, frame, x, y):  # type: ignore[no-untyped-def]
 def _gain(squared, variance, gate, density, share):  # type: ignore[no-untyped-def]
     """Log-likelihood ratio of one building: its nearest reference building at this squared distance, or
     (negative) none within the gate."""
-    if squared < 0.0:
-        return math.log(1.0 - share) + math.pi * density * gate * gate
+    if squared < 0.0:  # what chance puts there is as likely either way
+        return math.log(1.0 - share * (1.0 - math.exp(-0.5 * gate * gate / variance)))
     likely = share * math.exp(-0.5 * squared / variance) / (2.0 * math.pi * variance)
     return math.log(likely / density * math.exp(math.pi * density * squared) + (1.0 - share))
 

@@ -64,11 +64,12 @@ class Session:
         """Open a reference database; on failure there is none, and ``reason`` says why."""
         self.database_path, self.matcher = path, None
         try:
-            self.matcher = Matcher(open_database(Path(path), self.config), self.config)
+            matcher = Matcher(open_database(Path(path), self.config), self.config)
+            matcher.warm_up()
         except (BuildlocError, OSError) as error:
             self.reason = str(error)
             return False
-        self.reason = WAITING
+        self.matcher, self.reason = matcher, WAITING
         return True
 
     def add_mask(self, mask: Mask) -> Job | None:
