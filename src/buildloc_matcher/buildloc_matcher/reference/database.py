@@ -17,6 +17,7 @@ import os
 import uuid
 import zlib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -220,7 +221,8 @@ class DatabaseWriter:
             if file.name != MANIFEST and (ours != self._committed):
                 file.unlink(missing_ok=True)
         if self._made and not self._committed:
-            self._path.rmdir()
+            with suppress(OSError):  # another build is writing into it
+                self._path.rmdir()
 
 
 def _is_ours(path: Path) -> bool:
