@@ -322,8 +322,8 @@ def _open(path: Path, config: MatcherConfig, box_m: Box | None) -> ReferenceData
         tiles = tuple(_open_tile(path, tile) for tile in wanted)
     except (KeyError, IndexError, ValueError, TypeError, pa.ArrowException) as error:
         raise DatabaseError(f"{path}: reference database is damaged; {REBUILD}") from error
-    if not tiles:
-        raise DatabaseError(f"{path}: has no tile in the region asked for; see `buildloc refdb info`")
+    if not any(tile.owned for tile in tiles):
+        raise DatabaseError(f"{path}: has no building in the region asked for; see `buildloc refdb info`")
     return ReferenceDatabase(epsg, tiles, str(manifest["descriptor_hash"]))
 
 
