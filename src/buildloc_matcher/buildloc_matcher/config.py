@@ -37,7 +37,9 @@ class MatcherConfig:
     )
     centre_weight: float = param(3.0, "weight of the central triangle; its neighbours weigh 1", 0.1, 10.0)
     matches_per_star: int = param(100, "best reference matches kept per query star", 1, 10000)
-    max_stars: int = param(64, "stars of a map that a first look matches, a fixed sample; 0: all", 0, 1000000)
+    max_stars: int = param(
+        64, "stars of a map that a first look matches, a fixed sample; 0: 4096", 0, 1000000
+    )
     second_look: int = param(
         8, "thinned triangulations added when the first look convinces nobody; 0: no second look", 0, 32
     )
