@@ -11,6 +11,7 @@ that is killed, never changes a table in use.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -354,8 +355,11 @@ def _open_tile(path: Path, entry: Mapping[str, Any]) -> Tile:
 
 
 def _table(file: Path, entry: Mapping[str, Any]) -> pa.Table:
-    with pa.memory_map(str(file)) as mapped:
-        data = mapped.read_buffer()
+    try:
+        with pa.memory_map(str(file)) as mapped:
+            data = mapped.read_buffer()
+    except FileNotFoundError as error:  # Arrow's own does not say which
+        raise FileNotFoundError(errno.ENOENT, "no such table", str(file)) from error
     if data.size != entry["bytes"] or zlib.crc32(data) != entry["crc32"]:
         raise DatabaseError(f"{file}: is truncated or damaged; {REBUILD}")
     return pa.ipc.open_file(data).read_all()
