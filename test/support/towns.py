@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable
 from functools import cache
@@ -133,3 +134,22 @@ def whole(buildings: Buildings, config: MatcherConfig = DEFAULT) -> ReferenceDat
 
 
 Town = Callable[[], Buildings]
+
+
+def strip(buildings: Buildings, length_m: float, half_width_m: float) -> Buildings:
+    """The buildings along a straight line eastwards through the middle, sorted from its western end."""
+    low, high = extent(buildings)
+    along, across = (buildings.centroids_m - (low + high) / 2.0).T
+    inside = (np.abs(along) < length_m / 2.0) & (np.abs(across) < half_width_m)
+    rows = np.flatnonzero(inside)
+    return buildings.select(rows[np.argsort(along[rows])])
+
+
+def bent(points_m: FloatArray, bend_deg: float, jitter_m: float = 0.0, seed: int = 1) -> FloatArray:
+    """Points (N, 2) along an eastward line as a map has them whose heading drifts evenly by so much from its
+    western to its eastern end: the line has become an arc."""
+    along, across = (points_m - points_m.mean(axis=0)).T
+    radius = np.ptp(along) / math.radians(bend_deg)
+    turn = along / radius
+    arc = np.column_stack([(radius - across) * np.sin(turn), radius - (radius - across) * np.cos(turn)])
+    return arc + np.random.default_rng(seed).normal(0.0, jitter_m, arc.shape)
