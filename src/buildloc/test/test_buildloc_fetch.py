@@ -37,7 +37,7 @@ def test_it_ends_with_the_files_and_the_next_command(
     assert licence == "licence: CDLA-Permissive-2.0"
     command = shlex.split(following.removeprefix("next: "))
     build = parser().parse_args(command[1:])
-    assert build.sources == [file.path for file in files] and build.out == folder / "reference.arrow"
+    assert build.sources == [file.path for file in files] and build.out == folder / "reference.bldb"
     assert (build.center, build.radius_km) == ((-33.86, 151.2), 12.5)
 
 
