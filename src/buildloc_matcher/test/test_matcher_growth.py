@@ -115,7 +115,7 @@ def test_of_seeds_that_agree_one_is_grown() -> None:
 
 
 def test_each_of_two_places_that_look_alike_is_grown() -> None:
-    twin = np.vstack([CITY.centroids_m, CITY.centroids_m + (5000.0, 0.0)])
+    twin = np.vstack([CITY.centroids_m, np.add(CITY.centroids_m, (5000.0, 0.0))])
     query = query_map(bent_map())
     corners = np.array([MIDDLE, MIDDLE])
     places = SEEN.centroids_m[corners] + np.array([[[0.0, 0.0]], [[5000.0, 0.0]]])
@@ -128,7 +128,7 @@ def test_each_of_two_places_that_look_alike_is_grown() -> None:
 
 def test_a_part_that_nothing_connects_to_the_seed_is_never_reached() -> None:
     """Beyond a gap no neighbourhood leads: those buildings have no prediction and no match."""
-    far = bent_map(0.0) + (9e4, 0.0)
+    far = np.add(bent_map(0.0), (9e4, 0.0))
     query = np.vstack([bent_map(0.0), far])
     ((_, grown),) = grown_from(query, MIDDLE[None], SEEN.centroids_m[MIDDLE][None])
     count = len(SEEN)

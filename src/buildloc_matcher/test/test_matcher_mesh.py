@@ -34,9 +34,8 @@ def test_without_thinning_they_are_those_of_the_triangulation() -> None:
 def test_thinnings_add_stars_whose_triangle_is_new(thinnings: int) -> None:
     plain, before, found = stars(MAP), stars(MAP, thinnings - 1), stars(MAP, thinnings)
     count = len(before.corners)
-    assert triangles(found)[:count] == triangles(before) and triangles(found)[
-        : len(plain.corners)
-    ] == triangles(plain)
+    assert triangles(found)[:count] == triangles(before)
+    assert triangles(found)[: len(plain.corners)] == triangles(plain)
     assert len(set(triangles(found))) == len(found.corners) > count
     np.testing.assert_array_equal(found.stars.features[:count], before.stars.features)
     again = stars(MAP, thinnings)  # the same quarter is left out every time
@@ -67,15 +66,14 @@ def test_a_sample_is_as_large_as_asked_and_made_of_the_stars() -> None:
 
 
 def test_a_sample_lasts_while_the_map_grows() -> None:
-    before: Mesh | None = None
+    before = earlier = set[bytes]()
     for count in range(60, 121, 5):
         grown = MAP.select(np.arange(count))
-        sample, everything = stars(grown, max_stars=40), stars(grown)
-        if before is not None:
-            # A star of the sample that was there before was in the sample before.
-            lasting = names(sample) & earlier
-            assert lasting <= names(before) and lasting
-        before, earlier = sample, names(everything)
+        sample, everything = names(stars(grown, max_stars=40)), names(stars(grown))
+        # A star of the sample that was there before was in the sample before.
+        lasting = sample & earlier
+        assert lasting <= before and (lasting or not before)
+        before, earlier = sample, everything
 
 
 def test_too_few_buildings_have_no_stars() -> None:

@@ -9,6 +9,7 @@ from buildloc_msgs_py.types import FloatArray
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from towns import ORIGIN_M
 
 # Whole multiples of a quarter: many ties, duplicates and points on the borders of cells, without rounding.
 QUARTERS = st.integers(-4000, 4000).map(lambda n: n / 4.0)
@@ -53,10 +54,10 @@ def test_all_points_in_a_box_borders_included(reference: FloatArray, corners: Fl
 @pytest.mark.parametrize("count", [1, 2, 3000])
 def test_a_city_at_utm_coordinates(count: int) -> None:
     rng = np.random.default_rng(count)
-    city = rng.uniform(0.0, 2000.0, (count, 2)) + (320_000.0, 4_700_000.0)
+    city = np.add(rng.uniform(0.0, 2000.0, (count, 2)), ORIGIN_M)
     grid = grid_points(city)
     assert sorted(grid.order.tolist()) == list(range(count)) and grid.starts[-1] == count
-    for x, y in rng.uniform(-100.0, 2100.0, (200, 2)) + (320_000.0, 4_700_000.0):
+    for x, y in np.add(rng.uniform(-100.0, 2100.0, (200, 2)), ORIGIN_M):
         distances = np.hypot(*(city - (x, y)).T)
         place, squared = nearest(grid.points_m, grid.starts, grid.frame, x, y, 60.0)
         assert (place >= 0) == (distances.min() < 60.0)

@@ -124,7 +124,7 @@ def test_fits_recover_known_motions(yaw: float, x: float, y: float, scale: float
 
 def test_weights_decide_between_two_motions() -> None:
     points: FloatArray = CITY[:20]
-    target = np.concatenate([points[:10] + (5.0, 0.0), points[10:] + (0.0, 90.0)])
+    target = np.concatenate([np.add(points[:10], (5.0, 0.0)), np.add(points[10:], (0.0, 90.0))])
     weights = np.r_[np.ones(10), np.full(10, 1e-9)]
     np.testing.assert_allclose(fit_rigid(points, target, weights).apply(points[:10]), target[:10], atol=1e-3)
 

@@ -123,9 +123,11 @@ def test_the_local_transform_holds_where_it_is_asked_for() -> None:
         place = here.apply(BENT[at][None])[0]
         # Jitter of half a metre, and an arc of 300 m that lies 3 m beside its chord.
         assert np.hypot(*(place - SEEN.centroids_m[at])) < 4.0
-        # The heading drifts evenly, so a place's share of the length tells the turn there.
+        # The heading drifts evenly, so a place's share of the length tells the turn there. At the ends the
+        # neighbours are all on one side, and what little weight the far ones have pulls.
         along = (SEEN.centroids_m[at, 0] - SEEN.centroids_m[:, 0].min()) / np.ptp(SEEN.centroids_m[:, 0])
-        assert math.degrees(here.yaw_rad) == pytest.approx(20.0 * (0.5 - along), abs=3.0)
+        tolerance = 2.0 if 0.2 < share < 0.8 else 5.0
+        assert math.degrees(here.yaw_rad) == pytest.approx(20.0 * (0.5 - along), abs=tolerance)
     ends = [np.hypot(*(score.transform.apply(BENT[[i]])[0] - SEEN.centroids_m[i])) for i in (0, -1)]
     assert max(ends) > 10.0  # what one transform makes of the same places
 

@@ -21,18 +21,17 @@ def hypotheses(*rows: tuple[float, float, float, float], scale: float = 1.0) -> 
     table = np.array(rows, dtype=np.float64).reshape(-1, 4)
     count = len(table)
     return Hypotheses(
-        np.arange(count), np.zeros((count, 3, 2)), np.ascontiguousarray(table[:, :2]), np.radians(table[:, 2]),
-        np.full(count, scale), np.ascontiguousarray(table[:, 3]), 0, 0,
+        np.arange(count), np.zeros((count, 3, 2)), np.ascontiguousarray(table[:, :2]),
+        np.radians(table[:, 2]), np.full(count, scale), np.ascontiguousarray(table[:, 3]), 0, 0,
     )  # fmt: skip
 
 
 def test_a_bin_reaches_half_its_size_around_whole_multiples() -> None:
-    ballot = vote(
-        hypotheses(
-            (-49, 0, 0, 0.5), (49, 49, 0, 0.7), (0, -49, 0, 0.1), (51, 0, 0, 0.9), (149, 49, 0, 1.0), (0, 151, 0, 2)
-        ),
-        CONFIG,
+    three_bins = hypotheses(
+        (-49, 0, 0, 0.5), (49, 49, 0, 0.7), (0, -49, 0, 0.1),
+        (51, 0, 0, 0.9), (149, 49, 0, 1.0), (0, 151, 0, 2.0),
     )  # fmt: skip
+    ballot = vote(three_bins, CONFIG)
     assert (ballot.bins, ballot.consistent) == (3, 3)
     assert [(c.votes, c.members) for c in ballot.clusters] == [
         (2.0, 1),
@@ -82,7 +81,7 @@ def test_turning_all_headings_turns_the_clusters(turn: float, seed: int) -> None
     rows = np.column_stack(
         [rng.uniform(-160, 160, (40, 2)), rng.uniform(-180, 180, 40), rng.uniform(0.1, 1.0, 40)]
     )
-    turned = rows + [0.0, 0.0, turn, 0.0]
+    turned = np.add(rows, (0.0, 0.0, turn, 0.0))
     one, other = (vote(hypotheses(*map(tuple, r)), CONFIG) for r in (rows, turned))
     assert (one.bins, one.consistent) == (other.bins, other.consistent)
     for a, b in zip(one.clusters, other.clusters, strict=True):
