@@ -103,14 +103,14 @@ def _refdb_fetch(args: argparse.Namespace) -> int:
     from buildloc_matcher.reference.download import HttpConfig
     from buildloc_matcher.reference.fetch import (
         MICROSOFT_INDEX,
-        Area,
         OvertureMaps,
         fetch_microsoft,
         fetch_overture,
     )
+    from buildloc_matcher.reference.region import Circle
 
     latitude_deg, longitude_deg = args.center
-    area = Area(latitude_deg, longitude_deg, args.radius_km)
+    area = Circle(latitude_deg, longitude_deg, args.radius_km)
     if args.source == "overture":
         if args.index_url is not None:
             raise BuildlocError("--index-url is for --source microsoft; leave it out")
