@@ -46,7 +46,7 @@ def test_it_ends_with_the_files_and_the_next_command(
     ("arguments", "reason"),
     [
         (["--source", "microsoft", "--index-url", "ftp://host/x"], "correct the address"),
-        (["--source", "microsoft", "--radius-km", "0"], "search radius"),
+        (["--source", "microsoft", "--radius-km", "0"], "radius in km"),
         (["--source", "overture", "--index-url", "http://host/x"], "leave it out"),
     ],
 )
