@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -192,6 +194,23 @@ def test_people_read_a_table(folder: Path, capsys: pytest.CaptureFixture[str], t
     few = write_map(tmp_path / "few.geojson", MAP[:5])
     assert main(["locate", str(folder / "town.bldb"), str(few)]) == 0
     assert "no fix: map has 5 buildings, fewer than 12" in capsys.readouterr().out
+
+
+def test_processes_share_a_database(folder: Path, locate: Locate) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "buildloc.cli",
+        "locate",
+        folder / "town.bldb",
+        folder / "map.geojson",
+        "--json",
+    ]
+    running = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    answers = [json.loads(process.communicate()[0]) for process in running]
+    expected = locate()
+    for answer in answers:
+        assert answer["fix"] == expected["fix"] and answer["candidates"] == expected["candidates"]
 
 
 # Maps that give no fix, and say why
