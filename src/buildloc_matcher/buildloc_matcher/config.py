@@ -82,7 +82,7 @@ class MatcherConfig:
     min_lead: float = param(
         8.0, "smallest lead in evidence over the best candidate elsewhere, nats", 0.0, 1e4
     )
-    rival_distance_m: float = param(200.0, "candidates further away than this are elsewhere, m", 0.0, 1e6)
+    rival_distance_m: float = param(15.0, "candidates further away than this are elsewhere, m", 0.0, 1e6)
     min_pairs: int = param(10, "fewest distinct reference buildings matched for a fix", 3, 100000)
     max_residual_m: float = param(10.0, "largest RMS distance of the matched pairs for a fix, m", 0.1, 1000.0)
     sigma_floor_m: float = param(3.0, "smallest horizontal standard deviation reported, m", 0.1, 1000.0)
@@ -99,7 +99,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "score_angle_deg": 15.0, "score_perimeter": 1.0, "area_weight": 0.0, "centre_weight": 1.0,
         "matches_per_star": 50, "max_stars": 0, "second_look": 0, "votes": "score", "min_votes": 3,
         "top_k": 20, "selection": "rigid", "mnn_distance_m": 10.0, "refine_distance_m": 50.0,
-        "refine_last_distance_m": 15.0,
+        "refine_last_distance_m": 15.0, "rival_distance_m": 200.0,
     },
 }  # fmt: skip
 
