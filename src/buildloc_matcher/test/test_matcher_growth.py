@@ -114,6 +114,17 @@ def test_of_seeds_that_agree_one_is_grown() -> None:
     assert first == 0  # whichever comes first
 
 
+def test_what_other_seeds_took_is_free_again() -> None:
+    query = bent_map()
+    ((_, alone),) = grown_from(query, MIDDLE[None], SEEN.centroids_m[MIDDLE][None])
+    # Seeds beside the true one that match a part of the same buildings, wrongly: shifted by a house.
+    beside = np.array([np.roll(MIDDLE, 1), np.arange(3), np.arange(60, 63)])
+    places = np.concatenate([SEEN.centroids_m[beside + 1], SEEN.centroids_m[MIDDLE][None]])
+    found = dict(grown_from(query, np.concatenate([beside, MIDDLE[None]]), places))
+    np.testing.assert_array_equal(found[3].matches, alone.matches)
+    assert found[3].evidence == alone.evidence
+
+
 def test_each_of_two_places_that_look_alike_is_grown() -> None:
     twin = np.vstack([CITY.centroids_m, np.add(CITY.centroids_m, (5000.0, 0.0))])
     query = query_map(bent_map())

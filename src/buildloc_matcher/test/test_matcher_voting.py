@@ -72,6 +72,9 @@ def test_headings_wrap_around() -> None:
     # 6 degrees from one another over the seam, but 354 on the number line.
     (pair,) = vote(hypotheses((0, 0, 177, 1.0), (0, 0, -177, 1.0)), CONFIG).clusters
     assert pair.members == 2 and abs(math.degrees(pair.yaw_rad)) == pytest.approx(180.0)
+    # The two over the seam outweigh one that is heavier than either.
+    (heaviest,) = vote(hypotheses((0, 0, 177, 1.0), (0, 0, -177, 1.0), (0, 0, 90, 1.5)), CONFIG).clusters
+    assert (heaviest.votes, heaviest.members) == (2.0, 2)
 
 
 @settings(max_examples=60, deadline=None)
