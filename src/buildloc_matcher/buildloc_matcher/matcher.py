@@ -119,7 +119,7 @@ class Matcher:
         )
         if len(points) < FEWEST_BUILDINGS:
             return MatchResult((), (), None, {"buildings": len(points)}, clock.seconds)
-        query = query_map(points)
+        query = query_map(points, areas)
         for number, look in enumerate(self._looks, start=1):
             with clock.stage("describe"):
                 found = mesh(points, areas, shapes, look.thinnings, look.max_stars)

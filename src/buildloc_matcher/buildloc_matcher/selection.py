@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from buildloc_matcher.config import MatcherConfig
-from buildloc_matcher.evidence import Ground, QueryMap, placed_evidence
+from buildloc_matcher.evidence import Ground, QueryMap, area_evidence, placed_evidence, scale_evidence
 from buildloc_matcher.geometry import Similarity, fit_similarity
 from buildloc_matcher.growth import Grown, grow
 from buildloc_matcher.hypotheses import Hypotheses
@@ -127,7 +127,7 @@ def select(
         score = score_grown(_start(cluster, query), match, query, reference, config)
         if all(_apart(score, other) > config.mnn_distance_m for _, other in scored):
             scored.append((cluster, score))
-    return scored
+    return sorted(scored, key=lambda pair: -pair[1].evidence)
 
 
 def _apart(one: Score, other: Score) -> float:
@@ -168,7 +168,7 @@ def _start(cluster: Cluster, query: QueryMap) -> Similarity:
 def score_rigid(transform: Similarity, query: QueryMap, reference: Ground, config: MatcherConfig) -> Score:
     """A candidate as the paper scores it: one transform for the whole map."""
     moved = transform.apply(query.points_m)
-    return _scored(transform, moved, placed_evidence(moved, reference, config), reference, config)
+    return _scored(transform, moved, placed_evidence(moved, reference, config), query, reference, config)
 
 
 def score_grown(
@@ -185,13 +185,22 @@ def score_grown(
     transform = fit_similarity(query.points_m[matched], places, config.scale_gate)
     reached = ~np.isnan(grown.predicted_m[:, 0])
     moved = np.where(reached[:, None], grown.predicted_m, transform.apply(query.points_m))
-    return _scored(transform, moved, grown.evidence, reference, config)
+    return _scored(transform, moved, grown.evidence, query, reference, config)
 
 
 def _scored(
-    transform: Similarity, moved_m: FloatArray, evidence: float, reference: Ground, config: MatcherConfig
+    transform: Similarity,
+    moved_m: FloatArray,
+    evidence: float,
+    query: QueryMap,
+    reference: Ground,
+    config: MatcherConfig,
 ) -> Score:
+    """``evidence`` is that of the places; those of the areas and of the scale are added."""
     jaccard, pairs = mnn_jaccard(moved_m, reference, config)
     squared = np.sum((moved_m[pairs[:, 0]] - reference.buildings_m[pairs[:, 1]]) ** 2, axis=1)
     rms = math.sqrt(squared.mean()) if len(pairs) else math.inf
-    return Score(transform, moved_m, pairs, rms, jaccard, evidence)
+    around = reference.areas_m2[near(reference.grid, moved_m, config.observable_radius_m)]
+    ours, theirs = query.areas_m2[pairs[:, 0]], reference.areas_m2[pairs[:, 1]]
+    total = evidence + area_evidence(ours, theirs, around, config) + scale_evidence(transform.scale, config)
+    return Score(transform, moved_m, pairs, rms, jaccard, total)

@@ -81,7 +81,7 @@ class ReferenceDatabase:
     @cached_property
     def ground(self) -> Ground:
         """Finds the buildings near a place."""
-        return ground(self.centroids_m)
+        return ground(self.centroids_m, self.buildings.areas_m2)
 
     @cached_property
     def tables(self) -> tuple[StarTable, ...]:
