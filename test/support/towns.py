@@ -13,6 +13,7 @@ import pytest
 from buildloc_eval.observation import ObservedMap, observe_map, sensing
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.descriptors import describe
+from buildloc_matcher.evidence import Ground, QueryMap, ground, query_map
 from buildloc_matcher.matching import QueryStars, query_stars
 from buildloc_matcher.reference.buildings import Buildings
 from buildloc_matcher.reference.database import ReferenceDatabase, assemble, descriptor_hash
@@ -35,6 +36,16 @@ def buildings_at(points_m: FloatArray, seed: int, areas_m2: tuple[float, float] 
     areas = np.exp(rng.uniform(*np.log(areas_m2), len(points_m)))
     shapes = rng.uniform(0.3, 1.0, (len(points_m), 4))
     return Buildings(points_m, areas.astype(np.float32), shapes.astype(np.float32))
+
+
+def alike(points_m: FloatArray) -> Ground:
+    """A reference of buildings at (N, 2) that all have the same area."""
+    return ground(points_m, np.full(len(points_m), 150.0))
+
+
+def mapped(points_m: FloatArray) -> QueryMap:
+    """A map of buildings at (N, 2) that all have the same area."""
+    return query_map(points_m, np.full(len(points_m), 150.0))
 
 
 def town(

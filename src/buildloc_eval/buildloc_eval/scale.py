@@ -45,6 +45,7 @@ Progress = Callable[[str], None]
 
 SOURCE = "footprints/boston_osm.parquet"
 CORRECT_M = 100.0
+OUTSIDE_M = 1000.0
 REAL = "reference: real footprints (OpenStreetMap, greater Boston); maps: simulated; no images"
 
 
@@ -65,7 +66,8 @@ TIMED = "12 km"  # where the bars on time are
 
 @dataclass(frozen=True)
 class Plan:
-    """How much is run: ``maps`` for the default preset on the largest reference, a share of it elsewhere."""
+    """How much is run: ``maps`` of each kind that a bar is set for (60 buildings or more, levels 1 and 2, the
+    default preset, the largest reference), ``maps_elsewhere`` of every other kind."""
 
     sizes: tuple[Size, ...]
     buildings: tuple[int, ...]
@@ -232,15 +234,36 @@ def recall(
         matcher = method(name, database)
         matcher.warm_up()
         everything = largest and name == "default"
-        maps = plan.maps if everything else plan.maps_elsewhere
         for count in plan.buildings if everything else (60, 100):
             for level in plan.levels if everything else (1, 2):
+                barred = everything and count >= 60 and level <= 2
+                maps = plan.maps if barred else plan.maps_elsewhere
                 progress(f"{size.name}, {name}: {maps} maps of {count} buildings, level {level}")
                 drawn = (draw(database, tree, count, level, seed + i) for i in range(maps))
                 trials = [run_trial(matcher, observed) for observed in drawn]
                 kind = {"size": size.name, "method": name, "buildings": count, "level": level}
                 rows.append(kind | summary(trials))
     return rows
+
+
+def controls(
+    plan: Plan, database: ReferenceDatabase, reference: ReferenceDatabase, seed: int, progress: Progress
+) -> dict[str, Any]:
+    """Maps of ground that the reference does not hold: every fix is a false one."""
+    west, south, east, north = reference.bounds_m
+    x, y = database.centroids_m.T
+    reach = OUTSIDE_M
+    outside = (x < west - reach) | (x > east + reach) | (y < south - reach) | (y > north + reach)
+    away = database.buildings.select(np.flatnonzero(outside))
+    tree, matcher, tried, false = cKDTree(away.centroids_m), method("default", reference), 0, 0
+    for count in (60, 100):
+        for level in (1, 2):
+            progress(f"{plan.maps} maps of {count} buildings, level {level}, from outside the reference")
+            for i in range(plan.maps):
+                rng = np.random.default_rng([seed + i, count, level])
+                found = matcher.locate(observe_map(away, tree, count, sensing(level), rng).local_map)
+                tried, false = tried + 1, false + (matcher.refuse(found) is None)
+    return {"maps": tried, "false fixes": false, "reference": len(reference)}
 
 
 def evaluate(out: Path, seed: int, quick: bool, progress: Progress) -> str:
@@ -250,9 +273,10 @@ def evaluate(out: Path, seed: int, quick: bool, progress: Progress) -> str:
     out.mkdir(parents=True, exist_ok=True)
     references: dict[str, Any] = {}
     timing: dict[str, Any] = {}
+    outside: dict[str, Any] = {}
     rows: list[dict[str, Any]] = []
     for size in plan.sizes:
-        path = out / f"boston_{size.name.replace(' ', '')}.bldb"
+        path = _path(out, size)
         progress(f"building the reference of {size.name}")
         references[size.name] = built(size, source, path)
         database = open_database(path, matcher_config())
@@ -263,6 +287,9 @@ def evaluate(out: Path, seed: int, quick: bool, progress: Progress) -> str:
             timing = {name: against_oracle(database, some, name) for name in ("default", "paper")}
             timing["incremental"] = incremental(database, maps)
         rows += recall(plan, size, database, tree, seed, progress)
+        if size == plan.sizes[-1]:
+            smallest = open_database(_path(out, plan.sizes[0]), matcher_config())
+            outside = controls(plan, database, smallest, seed, progress)
         one = draw(database, tree, 100, 1, seed).local_map
         references[size.name]["memory_mb"] = peak_memory_mb(path, one)
     report = {
@@ -275,6 +302,7 @@ def evaluate(out: Path, seed: int, quick: bool, progress: Progress) -> str:
         "error model": {"digitiser": asdict(Digitiser()), "level 1": asdict(sensing(1))},
         "references": references,
         f"timing at {TIMED}": timing,
+        "maps from outside the reference": outside,
         "growth of time": growth_of_time(references, rows),
         "trials": rows,
     }
@@ -282,6 +310,10 @@ def evaluate(out: Path, seed: int, quick: bool, progress: Progress) -> str:
     pictures = draw_plots(out, references, rows)
     write_report(out / "report.html", "Matching against the size of the reference", report, pictures)
     return table(report)
+
+
+def _path(out: Path, size: Size) -> Path:
+    return out / f"boston_{size.name.replace(' ', '')}.bldb"
 
 
 def growth_of_time(references: dict[str, Any], rows: Sequence[dict[str, Any]]) -> dict[str, float]:
@@ -303,6 +335,7 @@ def table(report: dict[str, Any]) -> str:
         for name, r in report["references"].items()
     ]
     lines += ["", json.dumps(report[f"timing at {TIMED}"], indent=1), json.dumps(report["growth of time"])]
+    lines += [f"maps from outside the reference: {json.dumps(report['maps from outside the reference'])}"]
     lines += ["", "reference    method          bldgs  level  maps   R@1    R@5   R@10  error_m  false   ms"]
     for r in report["trials"]:
         error = "-" if r["median_error_m"] is None else f"{r['median_error_m']:.2f}"

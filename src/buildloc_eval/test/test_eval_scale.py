@@ -111,13 +111,14 @@ def test_a_small_run_on_real_footprints_writes_its_report(
         data_folder()
     except DataError as error:
         pytest.skip(str(error))
-    sizes = (Size("2 km", 2.0), Size("3 km", 3.0))
+    sizes = (Size("2 km", 2.0), Size("5 km", 5.0))
     monkeypatch.setattr(scale, "QUICK", Plan(sizes, (60, 100), (1,), 4, 3, ("paper",), 1))
-    monkeypatch.setattr(scale, "TIMED", "3 km")
+    monkeypatch.setattr(scale, "TIMED", "5 km")
     printed = scale.evaluate(tmp_path, 1, True, lambda _: None)
     report = json.loads((tmp_path / "report.json").read_text())
-    assert report["references"]["3 km"]["buildings"] > report["references"]["2 km"]["buildings"] > 1000
-    assert report["timing at 3 km"]["default"]["equal"] and report["timing at 3 km"]["paper"]["equal"]
+    assert report["references"]["5 km"]["buildings"] > report["references"]["2 km"]["buildings"] > 1000
+    assert report["timing at 5 km"]["default"]["equal"] and report["timing at 5 km"]["paper"]["equal"]
+    assert report["maps from outside the reference"]["false fixes"] == 0
     default = [r for r in report["trials"] if r["method"] == "default" and r["level"] == 1]
     assert len(default) == 4 and all(r["false_fixes"] == 0 for r in default)
     # A few km2 and the smallest errors: anything less than all would be a defect, not bad luck.

@@ -23,8 +23,8 @@ def candidate(x_m: float, yaw_deg: float, nats: float) -> Candidate:
 
 def test_the_lead_is_over_the_best_other_pose() -> None:
     best = candidate(0.0, 179.0, 50.0)
-    beside, turned_little = candidate(199.0, 179.0, 49.0), candidate(0.0, -162.0, 48.0)
-    elsewhere, turned = candidate(201.0, 179.0, 30.0), candidate(0.0, -160.0, 35.0)
+    beside, turned_little = candidate(14.0, 179.0, 49.0), candidate(0.0, -162.0, 48.0)
+    elsewhere, turned = candidate(16.0, 179.0, 30.0), candidate(0.0, -160.0, 35.0)
     assert lead(best, [], CONFIG) == lead(best, [beside, turned_little], CONFIG) == math.inf
     assert lead(best, [beside, elsewhere], CONFIG) == 20.0
     assert lead(best, [beside, elsewhere, turned], CONFIG) == 15.0  # 21 degrees over the seam
@@ -45,11 +45,11 @@ GOOD = Score(Similarity((0, 0), (0, 0), 0.0), np.zeros((20, 2)), np.zeros((20, 2
 @pytest.mark.parametrize(
     ("score", "lead_nats", "odds", "text"),
     [
-        (GOOD, 9.0, 14.9, "could be chance: log-odds 14.9, below 15"),
-        (replace(GOOD, jaccard=0.2), 9.0, 16.0, "MNN-Jaccard 0.20, below 0.25"),
-        (GOOD, 7.9, 16.0, "leads another place by 7.9 nats, below 8"),
-        (replace(GOOD, pairs=np.zeros((9, 2), np.int64)), 9.0, 16.0, "matches 9 buildings, fewer than 10"),
-        (replace(GOOD, rms_m=10.1), 9.0, 16.0, "residuals of 10.1 m, above 10 m"),
+        (GOOD, 21.0, 24.9, "could be chance: log-odds 24.9, below 25"),
+        (replace(GOOD, jaccard=0.15), 21.0, 26.0, "MNN-Jaccard 0.15, below 0.2"),
+        (GOOD, 19.9, 26.0, "leads another place by 19.9 nats, below 20"),
+        (replace(GOOD, pairs=np.zeros((9, 2), np.int64)), 21.0, 26.0, "matches 9 buildings, fewer than 10"),
+        (replace(GOOD, rms_m=10.1), 21.0, 26.0, "residuals of 10.1 m, above 10 m"),
     ],
 )
 def test_each_figure_that_falls_short_is_named(
@@ -57,7 +57,7 @@ def test_each_figure_that_falls_short_is_named(
 ) -> None:
     reason = refuse_coarse(score, lead_nats, odds, CONFIG)
     assert reason is not None and text in reason
-    assert refuse_coarse(GOOD, 8.0, 15.0, CONFIG) is None
+    assert refuse_coarse(GOOD, 20.0, 25.0, CONFIG) is None
 
 
 def test_each_figure_of_the_refinement_that_falls_short_is_named() -> None:

@@ -12,18 +12,18 @@ from buildloc_matcher.evidence import (
     NEIGHBOURS,
     NO_MATCH,
     WITNESSES,
-    ground,
+    area_evidence,
     placed_evidence,
-    query_map,
+    scale_evidence,
     seed_evidence,
     witnesses,
 )
 from buildloc_matcher.geometry import rotation
 from buildloc_msgs_py.types import FloatArray
-from towns import DEFAULT, lattice, strip, town
+from towns import DEFAULT, alike, lattice, mapped, strip, town
 
 CITY = town(61, 4000, 1900.0)  # 30 m apart on average
-GROUND = ground(CITY.centroids_m)
+GROUND = alike(CITY.centroids_m)
 SEEN = strip(CITY, 900.0, 70.0)
 TURN = rotation(2.5)
 TRIANGLES = describe(SEEN.centroids_m, SEEN.areas_m2, SEEN.shapes).vertices.astype(np.int64)
@@ -37,7 +37,7 @@ def as_map(points_m: FloatArray, sigma_m: float = 0.0) -> FloatArray:
 
 def evidence(query_m: FloatArray, triangles: np.ndarray, places_m: FloatArray) -> FloatArray:
     seeds = np.arange(len(triangles))
-    return seed_evidence(query_map(query_m), triangles, seeds, places_m, GROUND, DEFAULT)
+    return seed_evidence(mapped(query_m), triangles, seeds, places_m, GROUND, DEFAULT)
 
 
 @pytest.mark.parametrize("sigma_m", [0.0, 1.0])
@@ -76,8 +76,8 @@ def test_a_building_that_is_missing_costs_less_than_one_that_is_found_gains() ->
     last = witnesses(query, corners[None])[0][-1]
     hole = np.flatnonzero(np.hypot(*(CITY.centroids_m - SEEN.centroids_m[last]).T) > 30.0)
     without = seed_evidence(
-        query_map(query), corners[None], np.zeros(1, dtype=np.int64), SEEN.centroids_m[corners][None],
-        ground(CITY.centroids_m[hole]), DEFAULT,
+        mapped(query), corners[None], np.zeros(1, dtype=np.int64), SEEN.centroids_m[corners][None],
+        alike(CITY.centroids_m[hole]), DEFAULT,
     )[0]  # fmt: skip
     assert 0.0 < without < whole
 
@@ -93,11 +93,11 @@ def test_a_map_laid_where_it_belongs_and_elsewhere() -> None:
 
 
 def test_the_density_is_that_of_the_surroundings() -> None:
-    block = ground(lattice(40, 40, 25.0).centroids_m)
+    block = alike(lattice(40, 40, 25.0).centroids_m)
     # 1 in 625 m2, in cells of 100 m that hold four rows of four.
     assert block.density_per_m2[3:6, 3:6] == pytest.approx(1.0 / 625.0)
     assert np.all(block.density_per_m2 > 0.0)
-    lonely = ground(np.array([[0.0, 0.0], [2000.0, 2000.0]])).density_per_m2
+    lonely = alike(np.array([[0.0, 0.0], [2000.0, 2000.0]])).density_per_m2
     assert lonely[10, 10] == 2e-5
 
 
@@ -105,7 +105,7 @@ def test_neighbours_and_witnesses_are_the_nearest_others() -> None:
     points = SEEN.centroids_m
     distances = np.hypot(*(points[:, None] - points[None]).transpose(2, 0, 1))
     expected = np.argsort(distances, axis=1)[:, 1 : NEIGHBOURS + 1]
-    np.testing.assert_array_equal(query_map(points).neighbours, expected)
+    np.testing.assert_array_equal(mapped(points).neighbours, expected)
     near = witnesses(points, TRIANGLES[:5])
     for corners, others in zip(TRIANGLES[:5], near, strict=True):
         apart = np.hypot(*(points - points[corners].mean(axis=0)).T)
@@ -115,7 +115,27 @@ def test_neighbours_and_witnesses_are_the_nearest_others() -> None:
 
 def test_small_maps_have_fewer_neighbours_and_padded_witnesses() -> None:
     five = SEEN.centroids_m[:5]
-    assert query_map(five).neighbours.shape == (5, 4)
+    assert mapped(five).neighbours.shape == (5, 4)
     near = witnesses(five, np.array([[0, 1, 2]]))
     assert set(near[0, :2].tolist()) == {3, 4} and np.all(near[0, 2:] == NO_MATCH)
     assert witnesses(five, np.empty((0, 3), dtype=np.int64)).shape == (0, WITNESSES)
+
+
+def test_areas_speak_for_true_pairs_against_exchanged_ones_and_a_common_factor_is_no_matter() -> None:
+    rng = np.random.default_rng(4)
+    theirs = np.exp(rng.normal(5.0, 0.6, 60))
+    ours = theirs * np.exp(rng.normal(0.0, 0.2, 60))
+    true = area_evidence(ours, theirs, theirs, DEFAULT)
+    assert true > 15.0
+    assert area_evidence(1.3 * ours, theirs, theirs, DEFAULT) == pytest.approx(true)
+    exchanged = [area_evidence(rng.permutation(ours), theirs, theirs, DEFAULT) for _ in range(20)]
+    assert max(exchanged) < -5.0
+    # One wild area costs less than ln(5): it may always be something else.
+    wild = np.concatenate([[1e4], ours[1:]])
+    assert true - area_evidence(wild, theirs, theirs, DEFAULT) < 4.0
+    assert area_evidence(ours[:3], theirs[:3], theirs, DEFAULT) == 0.0
+
+
+def test_a_wrong_scale_speaks_against() -> None:
+    assert scale_evidence(1.0, DEFAULT) == 0.0
+    assert scale_evidence(1.1, DEFAULT) == pytest.approx(-2.0) == pytest.approx(scale_evidence(0.9, DEFAULT))

@@ -6,15 +6,15 @@ import math
 
 import numpy as np
 import pytest
-from buildloc_matcher.evidence import NO_MATCH, ground, query_map
+from buildloc_matcher.evidence import NO_MATCH
 from buildloc_matcher.geometry import fit_similarity, rotation
 from buildloc_matcher.growth import Grown, grow
 from buildloc_msgs_py.types import FloatArray
 from scipy.spatial import cKDTree
-from towns import DEFAULT, bent, strip, town
+from towns import DEFAULT, alike, bent, mapped, strip, town
 
 CITY = town(71, 5000, 2100.0)  # 30 m apart on average
-GROUND = ground(CITY.centroids_m)
+GROUND = alike(CITY.centroids_m)
 SEEN = strip(CITY, 1500.0, 60.0)
 ROWS = cKDTree(CITY.centroids_m).query(SEEN.centroids_m)[1]
 MIDDLE = np.argsort(np.hypot(*(SEEN.centroids_m - SEEN.centroids_m.mean(axis=0)).T))[:3]
@@ -26,7 +26,7 @@ def bent_map(jitter_m: float = 1.0) -> FloatArray:
 
 
 def grown_from(query_m: FloatArray, corners: np.ndarray, places_m: FloatArray) -> list[tuple[int, Grown]]:
-    return grow(query_map(query_m), corners, places_m, GROUND, DEFAULT)
+    return grow(mapped(query_m), corners, places_m, GROUND, DEFAULT)
 
 
 def one_to_one(grown: Grown) -> bool:
@@ -60,8 +60,8 @@ def test_buildings_that_the_reference_lacks_stay_unmatched() -> None:
     rng = np.random.default_rng(3)
     gone = rng.choice(np.setdiff1d(np.arange(len(SEEN)), MIDDLE), 25, replace=False)
     kept = np.delete(np.arange(len(CITY)), ROWS[gone])
-    fewer = ground(CITY.centroids_m[kept])
-    query = query_map(bent_map())
+    fewer = alike(CITY.centroids_m[kept])
+    query = mapped(bent_map())
     ((_, grown),) = grow(query, MIDDLE[None], SEEN.centroids_m[MIDDLE][None], fewer, DEFAULT)
     assert one_to_one(grown)
     there = np.setdiff1d(np.arange(len(SEEN)), gone)
@@ -127,10 +127,10 @@ def test_what_other_seeds_took_is_free_again() -> None:
 
 def test_each_of_two_places_that_look_alike_is_grown() -> None:
     twin = np.vstack([CITY.centroids_m, np.add(CITY.centroids_m, (5000.0, 0.0))])
-    query = query_map(bent_map())
+    query = mapped(bent_map())
     corners = np.array([MIDDLE, MIDDLE])
     places = SEEN.centroids_m[corners] + np.array([[[0.0, 0.0]], [[5000.0, 0.0]]])
-    found = grow(query, corners, places, ground(twin), DEFAULT)
+    found = grow(query, corners, places, alike(twin), DEFAULT)
     assert [number for number, _ in found] == [0, 1]
     one, other = (grown for _, grown in found)
     assert np.mean(other.matches - one.matches == len(CITY)) > 0.9

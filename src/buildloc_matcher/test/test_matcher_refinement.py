@@ -8,17 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from buildloc_matcher.config import matcher_config
-from buildloc_matcher.evidence import ground
 from buildloc_matcher.geometry import Similarity, fit_rigid, fit_similarity, rotation, wrap
 from buildloc_matcher.refinement import covariance_enu, horizontal_variance, observed_in_world, refine
 from buildloc_msgs_py.types import FloatArray, FrameObservation, Keyframe
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from towns import DEFAULT, town
+from towns import DEFAULT, alike, town
 
 SECOND = 10**9
 CITY = town(91, 900, 900.0, origin_m=(0.0, 0.0)).centroids_m
-GROUND = ground(CITY)
+GROUND = alike(CITY)
 POSES = [Keyframe(i * SECOND, 200.0 + 20.0 * i, 400.0 + 5.0 * i, 0.3 * i) for i in range(1, 21)]
 
 
@@ -89,8 +88,8 @@ def test_what_gives_no_refined_pose() -> None:
     assert refine(start, POSES, [], GROUND, DEFAULT) is None
     two = [FrameObservation(SEEN[-1].stamp_ns, SEEN[-1].centroids_m[:2], 105.0)]
     assert refine(start, POSES, two, GROUND, DEFAULT) is None
-    assert refine(start, POSES, SEEN, ground(CITY + 5000.0), DEFAULT) is None
-    one_house = ground(np.array([[9e3, 9e3], LAST]))
+    assert refine(start, POSES, SEEN, alike(CITY + 5000.0), DEFAULT) is None
+    one_house = alike(np.array([[9e3, 9e3], LAST]))
     assert refine(start, POSES, SEEN[-1:], one_house, DEFAULT) is None
 
 

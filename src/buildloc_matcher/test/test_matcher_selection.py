@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from buildloc_matcher.config import MatcherConfig, matcher_config
-from buildloc_matcher.evidence import Ground, ground, query_map
+from buildloc_matcher.evidence import Ground
 from buildloc_matcher.geometry import Similarity, fit_similarity
 from buildloc_matcher.growth import grow
 from buildloc_matcher.hypotheses import Hypotheses
@@ -21,12 +21,13 @@ from buildloc_matcher.selection import (
     score_grown,
     score_rigid,
     select,
+    shifted,
 )
 from buildloc_matcher.voting import Ballot, Cluster, vote
 from buildloc_msgs_py.types import FloatArray
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from towns import DEFAULT, bent, strip, town
+from towns import DEFAULT, alike, bent, mapped, strip, town
 
 PAPER = matcher_config({"preset": "paper"})
 QUERY = np.array([[0.0, 0.0], [100.0, 0.0], [100.0, 100.0], [0.0, 100.0]])
@@ -44,17 +45,17 @@ def test_mutual_pairs_by_hand() -> None:
 def test_jaccard_by_hand() -> None:
     config = replace(DEFAULT, observable_margin_m=15.0, observable_radius_m=60.0, mnn_distance_m=10.0)
     # Q: 4. R: the first three; (50, 50) is 71 m from every building, (100, 160) 60 m beyond the hull. M: 2.
-    assert observable(QUERY, ground(REFERENCE), config).tolist() == [0, 1, 2]
-    score, pairs = mnn_jaccard(QUERY, ground(REFERENCE), config)
+    assert observable(QUERY, alike(REFERENCE), config).tolist() == [0, 1, 2]
+    score, pairs = mnn_jaccard(QUERY, alike(REFERENCE), config)
     assert score == pytest.approx(2 / (4 + 3 - 2)) and pairs.tolist() == [[0, 0], [1, 2]]
     wider = replace(config, observable_radius_m=80.0)
-    assert mnn_jaccard(QUERY, ground(REFERENCE), wider)[0] == pytest.approx(2 / (4 + 4 - 2))
+    assert mnn_jaccard(QUERY, alike(REFERENCE), wider)[0] == pytest.approx(2 / (4 + 4 - 2))
     margin = replace(config, observable_margin_m=61.0)
-    assert observable(QUERY, ground(REFERENCE), margin).tolist() == [0, 1, 2, 3]
+    assert observable(QUERY, alike(REFERENCE), margin).tolist() == [0, 1, 2, 3]
 
 
 def test_jaccard_at_its_ends() -> None:
-    everything = ground(QUERY)
+    everything = alike(QUERY)
     assert mnn_jaccard(QUERY, everything, DEFAULT)[0] == 1.0
     assert mnn_jaccard(QUERY + 1000.0, everything, DEFAULT)[0] == 0.0
     assert mnn_jaccard(np.empty((0, 2)), everything, DEFAULT)[0] == 0.0
@@ -65,13 +66,13 @@ def test_jaccard_at_its_ends() -> None:
 def test_jaccard_counts_each_building_once_in_any_order(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     query, reference = rng.uniform(0, 300, (count, 2)), rng.uniform(0, 300, (60, 2))
-    score, pairs = mnn_jaccard(query, ground(reference), DEFAULT)
-    seen = observable(query, ground(reference), DEFAULT)
+    score, pairs = mnn_jaccard(query, alike(reference), DEFAULT)
+    seen = observable(query, alike(reference), DEFAULT)
     assert 0.0 <= score <= 1.0 and set(pairs[:, 1]) <= set(seen)
     assert score * (count + len(seen) - len(pairs)) == pytest.approx(len(pairs))
     assert len(np.unique(pairs[:, 0])) == len(np.unique(pairs[:, 1])) == len(pairs)
     order = rng.permutation(60)
-    assert mnn_jaccard(query, ground(reference[order]), DEFAULT)[0] == pytest.approx(score)
+    assert mnn_jaccard(query, alike(reference[order]), DEFAULT)[0] == pytest.approx(score)
 
 
 def test_a_flight_along_an_l_does_not_see_the_inside_of_its_hull() -> None:
@@ -80,7 +81,7 @@ def test_a_flight_along_an_l_does_not_see_the_inside_of_its_hull() -> None:
     x, y = np.meshgrid(np.arange(-100.0, 700.0, 20.0), np.arange(-100.0, 700.0, 20.0))
     city = np.column_stack([x.ravel(), y.ravel()])
     seen = np.zeros(len(city), dtype=bool)
-    seen[observable(flown, ground(city), DEFAULT)] = True
+    seen[observable(flown, alike(city), DEFAULT)] = True
     x, y = city.T
     near_a_leg = (np.minimum(np.abs(x), np.abs(y)) <= 50.0) & (x >= 0) & (y >= 0) & (x + y <= 600.0)
     inside = (x > 80.0) & (y > 80.0)
@@ -92,10 +93,10 @@ def test_a_flight_along_an_l_does_not_see_the_inside_of_its_hull() -> None:
 # A map that bends: 20 degrees over 1,200 m.
 
 CITY = town(81, 5000, 2100.0)
-GROUND = ground(CITY.centroids_m)
+GROUND = alike(CITY.centroids_m)
 SEEN = strip(CITY, 1200.0, 60.0)
 BENT = bent(SEEN.centroids_m, 20.0, 0.5)
-MAP = query_map(BENT)
+MAP = mapped(BENT)
 MIDDLE = np.argsort(np.hypot(*(SEEN.centroids_m - SEEN.centroids_m.mean(axis=0)).T))[:3]
 NOWHERE = Similarity((0.0, 0.0), (0.0, 0.0), 0.0)
 
@@ -198,3 +199,18 @@ def test_a_match_of_fewer_than_three_scores_as_its_cluster() -> None:
     lost = replace(grown, matches=np.full_like(grown.matches, -1))
     one, other = score_grown(start, lost, MAP, GROUND, DEFAULT), score_rigid(start, MAP, GROUND, DEFAULT)
     assert one.transform is start and (one.jaccard, one.evidence) == (other.jaccard, other.evidence)
+
+
+def test_a_seed_moves_from_house_to_house_and_turns_round() -> None:
+    x, y = np.meshgrid(np.arange(5) * 25.0, np.arange(5) * 25.0)
+    grid = np.column_stack([x.ravel(), y.ravel()])
+    seed = np.array([[50.0, 50.0], [75.0, 50.0], [50.0, 75.0]])
+    found = {tuple(map(tuple, triangle.tolist())) for triangle in shifted(seed, alike(grid), DEFAULT)}
+    beside = ((25.0, 50.0), (50.0, 50.0), (25.0, 75.0))
+    round_about = ((50.0, 50.0), (25.0, 50.0), (50.0, 25.0))
+    assert {beside, round_about} <= found
+    assert all((np.ptp(np.array(triangle), axis=0) == 25.0).all() for triangle in found)
+    # In a town without rows hardly any other three houses lie alike.
+    town_m = np.random.default_rng(2).uniform(0.0, 800.0, (640, 2))
+    middle = town_m[np.argsort(np.hypot(*(town_m - 400.0).T))[:3]]
+    assert len(shifted(middle, alike(town_m), DEFAULT)) < 40
