@@ -21,7 +21,7 @@ BAD_DATABASES = {
 }
 BAD_FOOTPRINTS: dict[str, tuple[list[dict[str, Any]], str]] = {
     "no": ([], "has no geometry at all"),
-    "only empty": ([{"type": "Polygon", "coordinates": []}], "no building polygon"),
+    "only empty": ([{"type": "Polygon", "coordinates": []}], "has no geometry at all"),
     # Polygons without any area: nothing that a repair could keep.
     "only invalid": (
         [{"type": "Polygon", "coordinates": [[[8.0, 47.0], [8.001, 47.0], [8.0, 47.0], [8.0, 47.0]]]}],

@@ -54,6 +54,12 @@ def _point(text: str) -> tuple[float, float]:
     return x, y
 
 
+def _count(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number, 0 or more")
+    return int(text)
+
+
 def _settings_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, help="YAML of ROS parameters")
     parser.add_argument(
@@ -111,14 +117,14 @@ def _refdb_fetch(args: argparse.Namespace) -> int:
     from buildloc_matcher.reference.download import HttpConfig
     from buildloc_matcher.reference.fetch import (
         MICROSOFT_INDEX,
-        Area,
         OvertureMaps,
         fetch_microsoft,
         fetch_overture,
     )
+    from buildloc_matcher.reference.region import Circle
 
     latitude_deg, longitude_deg = args.center
-    area = Area(latitude_deg, longitude_deg, args.radius_km)
+    area = Circle(latitude_deg, longitude_deg, args.radius_km)
     if args.source == "overture":
         if args.index_url is not None:
             raise BuildlocError("--index-url is for --source microsoft; leave it out")
@@ -410,7 +416,7 @@ def parser() -> argparse.ArgumentParser:
             _argument("database", type=Path, help="reference database"),
             _argument("map", type=Path, help="building polygons in local metres, GeoJSON or GeoParquet"),
             _argument("--at", type=_point, metavar="X,Y", help="local point to place (default: the mean)"),
-            _argument("--top", type=int, default=10, metavar="K", help="candidates listed (default 10)"),
+            _argument("--top", type=_count, default=10, metavar="K", help="candidates listed (default 10)"),
             preset,
             _argument("--json", action="store_true", help="machine-readable answer"),
         ),

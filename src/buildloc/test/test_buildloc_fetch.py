@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from buildloc.cli import main, parser
 from buildloc_matcher.reference import fetch
-from buildloc_matcher.reference.fetch import Area, Fetched
+from buildloc_matcher.reference.fetch import Fetched
+from buildloc_matcher.reference.region import Circle
 
 AREA = ["--center=-33.86,151.2", "--radius-km", "12.5"]
 
@@ -29,7 +30,7 @@ def test_it_ends_with_the_files_and_the_next_command(
 
     monkeypatch.setattr(fetch, "fetch_microsoft", fetched)
     assert main(["refdb", "fetch", "--source", "microsoft", *AREA, "--out", str(folder)]) == 0
-    assert asked == [Area(-33.86, 151.2, 12.5), folder, fetch.MICROSOFT_INDEX]
+    assert asked == [Circle(-33.86, 151.2, 12.5), folder, fetch.MICROSOFT_INDEX]
     printed = capsys.readouterr()
     assert printed.err == f"warning: {files[1].path}: has 9 bytes\n"
     *listed, licence, following = printed.out.splitlines()
@@ -37,7 +38,7 @@ def test_it_ends_with_the_files_and_the_next_command(
     assert licence == "licence: CDLA-Permissive-2.0"
     command = shlex.split(following.removeprefix("next: "))
     build = parser().parse_args(command[1:])
-    assert build.sources == [file.path for file in files] and build.out == folder / "reference.arrow"
+    assert build.sources == [file.path for file in files] and build.out == folder / "reference.bldb"
     assert (build.center, build.radius_km) == ((-33.86, 151.2), 12.5)
 
 
@@ -45,7 +46,7 @@ def test_it_ends_with_the_files_and_the_next_command(
     ("arguments", "reason"),
     [
         (["--source", "microsoft", "--index-url", "ftp://host/x"], "correct the address"),
-        (["--source", "microsoft", "--radius-km", "0"], "search radius"),
+        (["--source", "microsoft", "--radius-km", "0"], "radius in km"),
         (["--source", "overture", "--index-url", "http://host/x"], "leave it out"),
     ],
 )

@@ -73,6 +73,7 @@ def evaluate_live(
         f"{len(scored.fixes)} fixes received on /buildloc/fix; error in m: median {median}, last {last}, "
         f"largest {max(scored.errors_m, default=math.nan):.2f}; "
         f"{report.images} images, {report.dropped} dropped, "
-        f"{report.keyframes} keyframes, {report.maps} maps, {report.seconds:.0f} s"
+        f"{report.keyframes} keyframes, {report.maps} maps, {report.maps_skipped} overtaken, "
+        f"{report.seconds:.0f} s"
     )
     return LiveFlight(tuple(results), scored, report, fix_table(scored, truth), summary, drawn)

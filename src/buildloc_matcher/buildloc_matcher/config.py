@@ -37,7 +37,9 @@ class MatcherConfig:
     )
     centre_weight: float = param(3.0, "weight of the central triangle; its neighbours weigh 1", 0.1, 10.0)
     matches_per_star: int = param(100, "best reference matches kept per query star", 1, 10000)
-    max_stars: int = param(64, "stars of a map that a first look matches, a fixed sample; 0: all", 0, 1000000)
+    max_stars: int = param(
+        64, "stars of a map that a first look matches, a fixed sample; 0: 4096", 0, 1000000
+    )
     second_look: int = param(
         8, "thinned triangulations added when the first look convinces nobody; 0: no second look", 0, 32
     )
@@ -45,6 +47,9 @@ class MatcherConfig:
     scale_gate: float = param(0.15, "largest deviation of the map-to-world scale from 1", 0.0, 0.9)
     sigma_m: float = param(2.0, "error of a map building against its neighbours, per axis, m", 0.1, 50.0)
     match_share: float = param(0.7, "share of the map's buildings that the reference has", 0.05, 0.99)
+    sigma_log_area: float = param(0.25, "error of the logarithm of a map building's area", 0.01, 5.0)
+    area_share: float = param(0.8, "share of the matched buildings whose area is right up to that", 0.0, 0.99)
+    sigma_scale: float = param(0.05, "error of the map's scale, from that of the altitude", 0.001, 1.0)
     votes: str = param(
         "evidence", "what a hypothesis votes with: score (Eq. 3) or evidence of its surroundings"
     )
@@ -70,17 +75,17 @@ class MatcherConfig:
     refine_last_distance_m: float = param(8.0, "1-NN distance of the last refinement step, m", 0.1, 1000.0)
     refine_iterations: int = param(6, "refinement steps while the distance shrinks", 1, 100)
     min_buildings: int = param(12, "fewest buildings in the map for a fix", 3, 100000)
-    min_jaccard: float = param(0.25, "smallest MNN-Jaccard of an accepted candidate", 0.0, 1.0)
+    min_jaccard: float = param(0.2, "smallest MNN-Jaccard of an accepted candidate", 0.0, 1.0)
     min_log_odds: float = param(
-        15.0,
+        25.0,
         "smallest evidence of an accepted candidate beyond what chance gives in the reference, nats",
         -300.0,
         1e4,
     )
     min_lead: float = param(
-        8.0, "smallest lead in evidence over the best candidate elsewhere, nats", 0.0, 1e4
+        20.0, "smallest lead in evidence over the best candidate elsewhere, nats", 0.0, 1e4
     )
-    rival_distance_m: float = param(200.0, "candidates further away than this are elsewhere, m", 0.0, 1e6)
+    rival_distance_m: float = param(15.0, "candidates further away than this are elsewhere, m", 0.0, 1e6)
     min_pairs: int = param(10, "fewest distinct reference buildings matched for a fix", 3, 100000)
     max_residual_m: float = param(10.0, "largest RMS distance of the matched pairs for a fix, m", 0.1, 1000.0)
     sigma_floor_m: float = param(3.0, "smallest horizontal standard deviation reported, m", 0.1, 1000.0)
@@ -97,7 +102,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "score_angle_deg": 15.0, "score_perimeter": 1.0, "area_weight": 0.0, "centre_weight": 1.0,
         "matches_per_star": 50, "max_stars": 0, "second_look": 0, "votes": "score", "min_votes": 3,
         "top_k": 20, "selection": "rigid", "mnn_distance_m": 10.0, "refine_distance_m": 50.0,
-        "refine_last_distance_m": 15.0,
+        "refine_last_distance_m": 15.0, "rival_distance_m": 200.0,
     },
 }  # fmt: skip
 

@@ -32,6 +32,7 @@ STIFFNESS_M2 = 3.0 * 60.0**2  # how much a building's turn and scale hold to tho
 PASSES = 2
 GIVE_UP = -12.0
 TOUCHING_M = 0.01
+BLOCK = 64  # buildings whose largest support is kept, so that a map of many is not searched at every step
 
 
 @dataclass(frozen=True)
@@ -81,51 +82,102 @@ def _turn(j, query, near, state, points, turn, a, b):  # type: ignore[no-untyped
 
 
 @njit(nogil=True, cache=True)
+def _most_supported(support, most):  # type: ignore[no-untyped-def]
+    """The first building with the largest support, -1 where none has any; ``most`` is that of each block."""
+    block = 0
+    for b in range(1, len(most)):
+        if most[b] > most[block]:
+            block = b
+    if most[block] <= 0:
+        return -1
+    j = block * BLOCK
+    while support[j] != most[block]:
+        j += 1
+    return j
+
+
+@njit(nogil=True, cache=True)
+def _support(j, near, state, support, most):  # type: ignore[no-untyped-def]
+    """Count building j for the buildings near it that have not been tried."""
+    for m in range(near.shape[1]):
+        i = near[j, m]
+        if state[i] == UNKNOWN:
+            support[i] += 1
+            most[i // BLOCK] = max(most[i // BLOCK], support[i])
+
+
+@njit(nogil=True, cache=True)
+def _set_aside(j, support, most):  # type: ignore[no-untyped-def]
+    """Building j is not to be tried (again)."""
+    support[j] = 0
+    first = j // BLOCK * BLOCK
+    most[j // BLOCK] = support[first : first + BLOCK].max()
+
+
+@njit(nogil=True, cache=True)
+def _settle(j, place, state, taken):  # type: ignore[no-untyped-def]
+    """Match building j with a place that no other has, else with none; ``taken`` counts who has a place."""
+    if state[j] >= 0:
+        taken[state[j]] -= 1
+    state[j] = place if place >= 0 and taken[place] == 0 else NO_MATCH
+    if state[j] >= 0:
+        taken[place] += 1
+
+
+@njit(nogil=True, cache=True)
 def _grow(  # type: ignore[no-untyped-def]
-    query, near, corners, places, a, b, points, starts, frame, density, sigma, share, state, predicted
+    query, near, corners, places, a, b, points, starts, frame, density, sigma, share, taken, state, predicted
 ):
-    """Fill ``state`` (N,) and ``predicted`` (N, 2) from corners that lie on ``places``; the evidence."""
+    """Fill ``state`` (N,) and ``predicted`` (N, 2) from corners that lie on ``places``; the evidence.
+
+    ``taken`` counts the buildings of the map on every place; zero before and after.
+    """
+    total = _grown_evidence(
+        query, near, corners, places, a, b, points, starts, frame, density, sigma, share, taken, state,
+        predicted,
+    )  # fmt: skip
+    for place in state:
+        if place >= 0:
+            taken[place] = 0
+    return total
+
+
+@njit(nogil=True, cache=True)
+def _grown_evidence(  # type: ignore[no-untyped-def]
+    query, near, corners, places, a, b, points, starts, frame, density, sigma, share, taken, state, predicted
+):
     count = len(query)
     turn = np.empty((count, 2))
-    support = np.zeros(count)
+    support = np.zeros(count, np.int64)
+    most = np.zeros((count + BLOCK - 1) // BLOCK, np.int64)
     for j in range(count):
         state[j] = UNKNOWN
         predicted[j, 0] = predicted[j, 1] = math.nan
     for k in range(3):
         state[corners[k]] = places[k]
+        if places[k] >= 0:
+            taken[places[k]] += 1
     for k in range(3):
         _turn(corners[k], query, near, state, points, turn, a, b)
-        for m in range(near.shape[1]):
-            support[near[corners[k], m]] += 1.0
-    total, tried = 0.0, 0
+        _support(corners[k], near, state, support, most)
+    total = 0.0
     while True:
         # Next comes the building with the most matched neighbours: the surest prediction.
-        j = -1
-        for i in range(count):
-            if state[i] == UNKNOWN and support[i] > 0.0 and (j < 0 or support[i] > support[j]):
-                j = i
+        j = _most_supported(support, most)
         if j < 0:
             break
+        _set_aside(j, support, most)
         x, y, a, b, variance, weight = _predict(j, query, near, state, points, turn, sigma)
         if weight == 0.0:
-            support[j] = 0.0
             continue
         gate = min(MAX_GATE_M, GATE_SIGMAS * math.sqrt(variance))
         place, squared = nearest(points, starts, frame, x, y, gate)
-        taken = False
-        for i in range(count):
-            if place >= 0 and state[i] == place:
-                taken = True
-        if place < 0 or taken:
-            state[j] = NO_MATCH
-            total += _gain(-1.0, variance, gate, _density(density, frame, x, y), share)
-        else:
-            state[j] = place
-            total += _gain(squared, variance, gate, _density(density, frame, x, y), share)
+        _settle(j, place, state, taken)
+        matched = state[j] >= 0
+        total += _gain(squared if matched else -1.0, variance, gate, _density(density, frame, x, y), share)
+        if matched:
             _turn(j, query, near, state, points, turn, a, b)
-            for m in range(near.shape[1]):
-                support[near[j, m]] += 1.0
-        tried += 1
+            _support(j, near, state, support, most)
         if total < GIVE_UP:
             return total
     # Once more with all neighbours known: early guesses are put right, and the evidence is the final one.
@@ -135,22 +187,16 @@ def _grow(  # type: ignore[no-untyped-def]
             x, y, a, b, variance, weight = _predict(j, query, near, state, points, turn, sigma)
             if weight == 0.0:
                 if state[j] >= 0:
-                    state[j] = NO_MATCH
+                    _settle(j, -1, state, taken)
                 continue
             predicted[j, 0], predicted[j, 1] = x, y
             gate = min(MAX_GATE_M, GATE_SIGMAS * math.sqrt(variance))
             place, squared = nearest(points, starts, frame, x, y, gate)
-            taken = False
-            for i in range(count):
-                if place >= 0 and i != j and state[i] == place:
-                    taken = True
+            _settle(j, place, state, taken)
+            matched = state[j] >= 0
             here = _density(density, frame, x, y)
-            if place < 0 or taken:
-                state[j] = NO_MATCH
-                total += _gain(-1.0, variance, gate, here, share)
-            else:
-                state[j] = place
-                total += _gain(squared, variance, gate, here, share)
+            total += _gain(squared if matched else -1.0, variance, gate, here, share)
+            if matched:
                 _turn(j, query, near, state, points, turn, a, b)
     return total
 
@@ -174,6 +220,7 @@ def grow(
     where = (reference.grid.points_m, reference.grid.starts, reference.grid.frame)
     settings = (reference.density_per_m2, config.sigma_m, config.match_share)
     states = np.empty((len(corners), len(query.points_m)), dtype=np.int64)
+    taken = np.zeros(len(reference.buildings_m), dtype=np.int32)
     grown: list[tuple[int, Grown]] = []
     for c, triangle in enumerate(corners):
         seats = np.array([nearest(*where, x, y, TOUCHING_M)[0] for x, y in places_m[c]], dtype=np.int64)
@@ -181,7 +228,7 @@ def grow(
             continue
         state, predicted = states[len(grown)], np.empty((len(query.points_m), 2))
         start = (triangle, seats, turns[c].real, turns[c].imag)
-        nats = _grow(query.points_m, query.neighbours, *start, *where, *settings, state, predicted)
+        nats = _grow(query.points_m, query.neighbours, *start, *where, *settings, taken, state, predicted)
         if nats > 0.0:
             matched = np.where(state >= 0, reference.grid.order[np.maximum(state, 0)], NO_MATCH)
             grown.append((c, Grown(matched, predicted, nats)))

@@ -26,6 +26,7 @@ from buildloc_matcher.voting import Cluster, vote
 
 FEWEST_BUILDINGS = 4
 WARM_UP_BUILDINGS = 40
+MOST_STARS = 4096  # of one look; those of a map of 100,000 buildings, matched, would fill 30 GB
 
 
 @dataclass(frozen=True)
@@ -89,9 +90,9 @@ class Matcher:
         self.database = database
         self.config = config
         second = replace(config, matches_per_star=config.second_look_matches)
-        self._looks = [_Look(0, config.max_stars, star_matcher(database.tables, config))]
+        self._looks = [_Look(0, config.max_stars or MOST_STARS, star_matcher(database.tables, config))]
         if config.second_look:
-            self._looks.append(_Look(config.second_look, 0, star_matcher(database.tables, second)))
+            self._looks.append(_Look(config.second_look, MOST_STARS, star_matcher(database.tables, second)))
 
     def warm_up(self) -> None:
         """Locate a piece of the reference itself: compiled code is loaded, and on a new machine compiled
@@ -118,7 +119,7 @@ class Matcher:
         )
         if len(points) < FEWEST_BUILDINGS:
             return MatchResult((), (), None, {"buildings": len(points)}, clock.seconds)
-        query = query_map(points)
+        query = query_map(points, areas)
         for number, look in enumerate(self._looks, start=1):
             with clock.stage("describe"):
                 found = mesh(points, areas, shapes, look.thinnings, look.max_stars)

@@ -33,9 +33,9 @@ from buildloc_matcher.star_index import (
 SMALL_STEP = np.float32(SMALL_ANGLE_RAD / STEPS)
 MIDDLE_STEP = np.float32(MIDDLE_ANGLE_RAD / STEPS)
 SHAPE_STEP = np.float32(1.0 / STEPS)
-PERIMETER_MIN = np.float32(math.log(PERIMETERS_M[0]))
+PERIMETER_MIN, PERIMETER_MAX = (np.float32(math.log(end)) for end in PERIMETERS_M)
 PERIMETER_STEP = np.float32(math.log(PERIMETERS_M[1] / PERIMETERS_M[0]) / STEPS)
-AREA_MIN = np.float32(math.log(AREAS_M2[0]))
+AREA_MIN, AREA_MAX = (np.float32(math.log(end)) for end in AREAS_M2)
 AREA_STEP = np.float32(math.log(AREAS_M2[1] / AREAS_M2[0]) / STEPS)
 PI = np.float32(math.pi)
 SLACK = np.float32(1e-4)  # bounds are loosened by more than float32 rounds
@@ -124,13 +124,20 @@ def scoring(config: MatcherConfig) -> tuple[np.float32, ...]:
     return tuple(np.float32(value) for value in values)
 
 
+@njit(nogil=True, cache=True, inline="always")
+def _log_within(value, low, high):  # type: ignore[no-untyped-def]
+    """The logarithm of a value, or the end of the range that it lies beyond."""
+    return min(high, max(low, np.float32(math.log(max(value, TINY)))))
+
+
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
 def _bounds(star, areas, settings, sketches, begin, end, bounds):  # type: ignore[no-untyped-def]
     """The largest score that a run of sketches allows, times the sum of all weights; IMPOSSIBLE where Eq. 1
     fails.
 
-    A step stands for its middle, give or take half a step. One loop a triangle, without branches: the
-    compiler turns it into vector instructions, which is what makes the search fast.
+    A step stands for its middle, give or take half a step; what lies beyond the first or the last counts as
+    their end on both sides, which brings the two no further apart. One loop a triangle, without branches:
+    the compiler turns it into vector instructions, which is what makes the search fast.
     """
     tau_angle, _, tau_shape, angle, perimeter, area, area_weight, centre_weight = settings
     per_angle, per_perimeter, per_area = ONE / angle, ONE / perimeter, ONE / area
@@ -146,8 +153,8 @@ def _bounds(star, areas, settings, sketches, begin, end, bounds):  # type: ignor
         steps_a = sketches[AREA_ROW + max(0, j - 1), begin:end]
         off1, off2 = half1 - star[j, 0], half2 - star[j, 1]
         off3 = (PI - half1 - half2) - (PI - star[j, 0] - star[j, 1])
-        off_p = PERIMETER_MIN + half_p - np.float32(math.log(max(star[j, PERIMETER], TINY)))
-        off_a = AREA_MIN + half_a - np.float32(math.log(max(star[j, AREA], TINY)))
+        off_p = PERIMETER_MIN + half_p - _log_within(star[j, PERIMETER], PERIMETER_MIN, PERIMETER_MAX)
+        off_a = AREA_MIN + half_a - _log_within(star[j, AREA], AREA_MIN, AREA_MAX)
         limit = tau_angle if j == 0 else HUGE
         weight = centre_weight if j == 0 else ONE
         weight_a = ZERO if j == 0 else area_weight
@@ -283,7 +290,7 @@ def _candidates(star, areas, settings, sketches, starts, enough):  # type: ignor
     low1, high1, low2, high2, low_p, high_p = _window(star, settings[0], settings[1])
     logs = np.empty(3, np.float32)
     for m in range(3):
-        logs[m] = math.log(max(areas[m], TINY))
+        logs[m] = _log_within(areas[m], AREA_MIN, AREA_MAX)
     size = 0
     for c1 in range(low1, high1 + 1):
         size += starts[c1 * MIDDLE_CELLS + high2 + 1] - starts[c1 * MIDDLE_CELLS + low2]

@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from buildloc_matcher.config import MatcherConfig
-from buildloc_matcher.evidence import Ground, QueryMap, placed_evidence
+from buildloc_matcher.evidence import Ground, QueryMap, area_evidence, placed_evidence, scale_evidence
 from buildloc_matcher.geometry import Similarity, fit_similarity
 from buildloc_matcher.growth import Grown, grow
 from buildloc_matcher.hypotheses import Hypotheses
-from buildloc_matcher.point_grid import near
+from buildloc_matcher.point_grid import near, nearest
 from buildloc_matcher.voting import Ballot, Cluster
 
 GROWN_SCORED = 10  # distinct grown matches that get the full score
 NEGLIGIBLE_NATS = 30.0  # a match that much less likely than the best is not listed
+SHIFT_M = 100.0  # how far a match is moved to see whether it fits as well there
 LOCAL_M = 100.0
 FAR_WEIGHT = 1e-3
 
@@ -105,21 +106,56 @@ def select(
     if config.selection == "rigid":
         rigid = [(c, score_rigid(_start(c, query), query, reference, config)) for c in ballot.clusters]
         return sorted(rigid, key=lambda pair: (-pair[1].jaccard, -pair[0].votes))
+    if not ballot.clusters:
+        return []
     best = [cluster.best for cluster in ballot.clusters]
-    grown = grow(query, corners[voters.stars[best]], voters.places_m[best], reference, config)
+    seeds, places = corners[voters.stars[best]], voters.places_m[best]
+    grown = sorted(grow(query, seeds, places, reference, config), key=lambda found: -found[1].evidence)
+    if grown:
+        first = grown[0][0]
+        moved = shifted(places[first], reference, config)
+        rivals = grow(
+            query, np.repeat(seeds[first : first + 1], len(moved), axis=0), moved, reference, config
+        )
+        grown += [(first, match) for _, match in rivals]
+        grown.sort(key=lambda found: -found[1].evidence)
     scored: list[tuple[Cluster, Score]] = []
-    places: list[FloatArray] = []
-    ranked = sorted(grown, key=lambda found: -found[1].evidence)
-    for c, match in ranked:
-        if len(scored) == GROWN_SCORED or match.evidence < ranked[0][1].evidence - NEGLIGIBLE_NATS:
+    for c, match in grown:
+        if len(scored) == GROWN_SCORED or match.evidence < grown[0][1].evidence - NEGLIGIBLE_NATS:
             break
-        place = np.nanmean(match.predicted_m, axis=0)
-        if any(np.hypot(*(place - other)) < config.mnn_distance_m for other in places):
-            continue  # grown from another seed into the same match
-        places.append(place)
         cluster = ballot.clusters[c]
-        scored.append((cluster, score_grown(_start(cluster, query), match, query, reference, config)))
-    return scored
+        score = score_grown(_start(cluster, query), match, query, reference, config)
+        if all(_apart(score, other) > config.mnn_distance_m for _, other in scored):
+            scored.append((cluster, score))
+    return sorted(scored, key=lambda pair: -pair[1].evidence)
+
+
+def _apart(one: Score, other: Score) -> float:
+    """Median distance between the places of the map's buildings, m: small where two seeds gave one match."""
+    return float(np.median(np.linalg.norm(one.moved_m - other.moved_m, axis=1)))
+
+
+def shifted(places_m: FloatArray, reference: Ground, config: MatcherConfig) -> FloatArray:
+    """(K, 3, 2) other triangles of reference buildings, as a seed (3, 2) moved from house to house meets
+    them, as it is and turned by half a circle.
+
+    Streets repeat themselves: in a regular row a match fits as well one house further on, or the other way
+    round. Votes do not show that, since the voting bins are larger than a house.
+    """
+    grid = reference.grid
+    around = reference.buildings_m[near(grid, places_m[:1], SHIFT_M)]
+    found = []
+    for turn in (1.0, -1.0):
+        turned = places_m.mean(axis=0) + turn * (places_m - places_m.mean(axis=0))
+        for target in around:
+            moved = turned + (target - turned[0])
+            hits = [
+                nearest(grid.points_m, grid.starts, grid.frame, x, y, config.mnn_distance_m)[0]
+                for x, y in moved
+            ]
+            if min(hits) >= 0 and len(set(hits)) == len(hits):
+                found.append(grid.points_m[hits])
+    return np.array(found).reshape(-1, 3, 2)
 
 
 def _start(cluster: Cluster, query: QueryMap) -> Similarity:
@@ -132,7 +168,7 @@ def _start(cluster: Cluster, query: QueryMap) -> Similarity:
 def score_rigid(transform: Similarity, query: QueryMap, reference: Ground, config: MatcherConfig) -> Score:
     """A candidate as the paper scores it: one transform for the whole map."""
     moved = transform.apply(query.points_m)
-    return _scored(transform, moved, placed_evidence(moved, reference, config), reference, config)
+    return _scored(transform, moved, placed_evidence(moved, reference, config), query, reference, config)
 
 
 def score_grown(
@@ -149,13 +185,22 @@ def score_grown(
     transform = fit_similarity(query.points_m[matched], places, config.scale_gate)
     reached = ~np.isnan(grown.predicted_m[:, 0])
     moved = np.where(reached[:, None], grown.predicted_m, transform.apply(query.points_m))
-    return _scored(transform, moved, grown.evidence, reference, config)
+    return _scored(transform, moved, grown.evidence, query, reference, config)
 
 
 def _scored(
-    transform: Similarity, moved_m: FloatArray, evidence: float, reference: Ground, config: MatcherConfig
+    transform: Similarity,
+    moved_m: FloatArray,
+    evidence: float,
+    query: QueryMap,
+    reference: Ground,
+    config: MatcherConfig,
 ) -> Score:
+    """``evidence`` is that of the places; those of the areas and of the scale are added."""
     jaccard, pairs = mnn_jaccard(moved_m, reference, config)
     squared = np.sum((moved_m[pairs[:, 0]] - reference.buildings_m[pairs[:, 1]]) ** 2, axis=1)
     rms = math.sqrt(squared.mean()) if len(pairs) else math.inf
-    return Score(transform, moved_m, pairs, rms, jaccard, evidence)
+    around = reference.areas_m2[near(reference.grid, moved_m, config.observable_radius_m)]
+    ours, theirs = query.areas_m2[pairs[:, 0]], reference.areas_m2[pairs[:, 1]]
+    total = evidence + area_evidence(ours, theirs, around, config) + scale_evidence(transform.scale, config)
+    return Score(transform, moved_m, pairs, rms, jaccard, total)

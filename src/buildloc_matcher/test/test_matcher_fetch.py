@@ -28,7 +28,6 @@ import pytest
 from buildloc_matcher.reference import fetch
 from buildloc_matcher.reference.download import FetchError, HttpConfig, read_manifest, sha256
 from buildloc_matcher.reference.fetch import (
-    Area,
     Box,
     Fetched,
     Link,
@@ -41,22 +40,23 @@ from buildloc_matcher.reference.fetch import (
     quadkeys,
     size_doubt,
 )
+from buildloc_matcher.reference.region import Circle, RegionError
 from pyproj import Geod
 from shapely.geometry import box
 
 ONCE = HttpConfig(timeout_s=5.0, attempts=1, backoff_s=0.0)
 TWICE = HttpConfig(timeout_s=5.0, attempts=2, backoff_s=0.0)
-BOSTON = Area(42.36, -71.06, 1.0)
-BASEL = Area(47.56, 7.59, 1.0)  # listed under three countries
+BOSTON = Circle(42.36, -71.06, 1.0)
+BASEL = Circle(47.56, 7.59, 1.0)  # listed under three countries
 RELEASE = "/2026-08-13/global-buildings.geojsonl"
 
 
-def key_of(area: Area) -> str:
+def key_of(area: Circle) -> str:
     return str(mercantile.quadkey(mercantile.tile(area.longitude_deg, area.latitude_deg, 9)))
 
 
 @functools.cache
-def tile_bytes(area: Area, seed: int = 0, count: int = 4000) -> bytes:
+def tile_bytes(area: Circle, seed: int = 0, count: int = 4000) -> bytes:
     """Gzipped GeoJSON lines, several chunks long: random digits do not compress."""
     rng = np.random.default_rng(seed)
     lines = []
@@ -174,7 +174,9 @@ def quiet(_: str) -> None:
     pass
 
 
-def microsoft(server: Server, folder: Path, area: Area = BOSTON, config: HttpConfig = ONCE) -> list[Fetched]:
+def microsoft(
+    server: Server, folder: Path, area: Circle = BOSTON, config: HttpConfig = ONCE
+) -> list[Fetched]:
     return fetch_microsoft(area, folder, f"{server.url}/dataset-links.csv", config, quiet)
 
 
@@ -449,7 +451,7 @@ def test_an_impossible_address(tmp_path: Path, url: str) -> None:
 
 def test_no_data_for_the_area(server: Server, tmp_path: Path) -> None:
     with pytest.raises(FetchError, match=r"lists no buildings within 1 km of -40\.0+, -20\.0+"):
-        microsoft(server, tmp_path, Area(-40.0, -20.0, 1.0))
+        microsoft(server, tmp_path, Circle(-40.0, -20.0, 1.0))
     assert not server.asked("quadkey=")
 
 
@@ -473,14 +475,14 @@ def test_progress_says_how_far(server: Server, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("radius_km", [0.0, -1.0, float("nan"), float("inf")])
 def test_an_impossible_radius(radius_km: float) -> None:
-    with pytest.raises(FetchError, match="search radius"):
-        Area(0.0, 0.0, radius_km)
+    with pytest.raises(RegionError, match="not positive"):
+        Circle(0.0, 0.0, radius_km)
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_tiles_hold_every_point_of_the_circle(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    area = Area(float(rng.uniform(-75, 75)), float(rng.uniform(-180, 180)), float(rng.uniform(1, 200)))
+    area = Circle(float(rng.uniform(-75, 75)), float(rng.uniform(-180, 180)), float(rng.uniform(1, 200)))
     azimuth = rng.uniform(0, 360, 500)
     distance = area.radius_km * 1e3 * np.sqrt(rng.uniform(0, 1, 500))
     x, y, _ = Geod(ellps="WGS84").fwd(
@@ -502,13 +504,13 @@ def test_tiles_hold_every_point_of_the_circle(seed: int) -> None:
 
 def test_tiles_that_the_circle_misses_are_left_out() -> None:
     corner = mercantile.bounds(mercantile.quadkey_to_tile(key_of(BOSTON)))
-    near = Area(corner.north - 0.05, corner.west + 0.05, 5.9)  # the corner lies 6.9 km away
+    near = Circle(corner.north - 0.05, corner.west + 0.05, 5.9)  # the corner lies 6.9 km away
     assert len(quadkeys(near)) == 3
-    assert len(quadkeys(Area(near.latitude_deg, near.longitude_deg, 7.0))) == 4
+    assert len(quadkeys(Circle(near.latitude_deg, near.longitude_deg, 7.0))) == 4
 
 
 def test_the_180th_meridian() -> None:
-    keys = quadkeys(Area(-16.8, 179.99, 10.0))  # Taveuni
+    keys = quadkeys(Circle(-16.8, 179.99, 10.0))  # Taveuni
     columns = {mercantile.quadkey_to_tile(key).x for key in keys}
     assert columns == {0, 511}
 
@@ -588,9 +590,9 @@ def overture(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monke
     return path
 
 
-def corner_area() -> Area:
+def corner_area() -> Circle:
     corner = mercantile.bounds(mercantile.quadkey_to_tile(key_of(BOSTON)))
-    return Area(corner.north, corner.west, 1.0)
+    return Circle(corner.north, corner.west, 1.0)
 
 
 def test_overture_splits_at_the_tiles_without_doubles(
@@ -628,7 +630,7 @@ def test_overture_is_not_fetched_twice_but_a_new_release_is(overture: Path, tmp_
 
 def test_overture_without_data(overture: Path, tmp_path: Path) -> None:
     with pytest.raises(FetchError, match=r"no buildings within 1 km of -40\.0.* in release 2026-10-21"):
-        fetch_overture(Area(-40.0, -20.0, 1.0), tmp_path, OvertureMaps(), quiet)
+        fetch_overture(Circle(-40.0, -20.0, 1.0), tmp_path, OvertureMaps(), quiet)
     assert not list(tmp_path.iterdir())
 
 

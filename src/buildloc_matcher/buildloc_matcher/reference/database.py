@@ -11,12 +11,14 @@ that is killed, never changes a table in use.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
 import uuid
 import zlib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -79,7 +81,7 @@ class ReferenceDatabase:
     @cached_property
     def ground(self) -> Ground:
         """Finds the buildings near a place."""
-        return ground(self.centroids_m)
+        return ground(self.centroids_m, self.buildings.areas_m2)
 
     @cached_property
     def tables(self) -> tuple[StarTable, ...]:
@@ -220,7 +222,8 @@ class DatabaseWriter:
             if file.name != MANIFEST and (ours != self._committed):
                 file.unlink(missing_ok=True)
         if self._made and not self._committed:
-            self._path.rmdir()
+            with suppress(OSError):  # another build is writing into it
+                self._path.rmdir()
 
 
 def _is_ours(path: Path) -> bool:
@@ -320,8 +323,8 @@ def _open(path: Path, config: MatcherConfig, box_m: Box | None) -> ReferenceData
         tiles = tuple(_open_tile(path, tile) for tile in wanted)
     except (KeyError, IndexError, ValueError, TypeError, pa.ArrowException) as error:
         raise DatabaseError(f"{path}: reference database is damaged; {REBUILD}") from error
-    if not tiles:
-        raise DatabaseError(f"{path}: has no tile in the region asked for; see `buildloc refdb info`")
+    if not any(tile.owned for tile in tiles):
+        raise DatabaseError(f"{path}: has no building in the region asked for; see `buildloc refdb info`")
     return ReferenceDatabase(epsg, tiles, str(manifest["descriptor_hash"]))
 
 
@@ -352,8 +355,11 @@ def _open_tile(path: Path, entry: Mapping[str, Any]) -> Tile:
 
 
 def _table(file: Path, entry: Mapping[str, Any]) -> pa.Table:
-    with pa.memory_map(str(file)) as mapped:
-        data = mapped.read_buffer()
+    try:
+        with pa.memory_map(str(file)) as mapped:
+            data = mapped.read_buffer()
+    except FileNotFoundError as error:  # Arrow's own does not say which
+        raise FileNotFoundError(errno.ENOENT, "no such table", str(file)) from error
     if data.size != entry["bytes"] or zlib.crc32(data) != entry["crc32"]:
         raise DatabaseError(f"{file}: is truncated or damaged; {REBUILD}")
     return pa.ipc.open_file(data).read_all()

@@ -36,6 +36,7 @@ from buildloc_matcher.reference.download import (
     read_manifest,
     today,
 )
+from buildloc_matcher.reference.region import Circle
 
 LEVEL = 9  # of the quadkeys that Microsoft files its buildings under
 EARTH_RADIUS_KM = 6371.0
@@ -53,27 +54,6 @@ OVERTURE_BUILDINGS = "s3://overturemaps-us-west-2/release/{release}/theme=buildi
 LONGEST_FEATURE = 1 << 24  # bytes of a line, beyond every real building
 
 Box = tuple[float, float, float, float]  # west, south, east, north in degrees
-
-
-@dataclass(frozen=True)
-class Area:
-    """A circle on the ground, WGS84."""
-
-    latitude_deg: float
-    longitude_deg: float
-    radius_km: float
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.radius_km < math.inf:
-            raise FetchError(f"radius of {self.radius_km:g} km is not positive; give the search radius in km")
-
-    def __str__(self) -> str:
-        return f"within {self.radius_km:g} km of {self.latitude_deg:.5f}, {self.longitude_deg:.5f}"
-
-    @property
-    def reach_km(self) -> float:
-        """Radius with everything that makes it uncertain."""
-        return self.radius_km * (1.0 + SPHERE_ERROR) + MARGIN_KM
 
 
 @dataclass(frozen=True)
@@ -97,13 +77,18 @@ class Link:
     size: str
 
 
+def _reach_km(area: Circle) -> float:
+    """Radius with everything that makes it uncertain."""
+    return area.radius_km * (1.0 + SPHERE_ERROR) + MARGIN_KM
+
+
 def _wrap(longitude_deg: float) -> float:
     return (longitude_deg + 180.0) % 360.0 - 180.0
 
 
-def _spans(area: Area) -> tuple[float, float, float]:
+def _spans(area: Circle) -> tuple[float, float, float]:
     """South, north and half width in degrees of the box around the circle."""
-    angle = min(area.reach_km / EARTH_RADIUS_KM, math.pi)
+    angle = min(_reach_km(area) / EARTH_RADIUS_KM, math.pi)
     south, north = area.latitude_deg - math.degrees(angle), area.latitude_deg + math.degrees(angle)
     if south <= -90.0 or north >= 90.0:  # a pole is inside
         return south, north, 360.0
@@ -111,13 +96,13 @@ def _spans(area: Area) -> tuple[float, float, float]:
     return south, north, math.degrees(width)
 
 
-def _offset(area: Area, tile: Any) -> tuple[Any, float]:
+def _offset(area: Circle, tile: Any) -> tuple[Any, float]:
     """Bounds of a tile and how far its west edge lies east of the centre, degrees."""
     bounds = mercantile.bounds(tile)
     return bounds, _wrap(bounds.west - area.longitude_deg)
 
 
-def _touches(area: Area, tile: Any) -> bool:
+def _touches(area: Circle, tile: Any) -> bool:
     bounds, west = _offset(area, tile)
     longitude = math.radians(min(max(0.0, west), west + bounds.east - bounds.west))
     here = math.radians(area.latitude_deg)
@@ -126,10 +111,10 @@ def _touches(area: Area, tile: Any) -> bool:
         math.sin((there - here) / 2.0) ** 2
         + math.cos(here) * math.cos(there) * math.sin(longitude / 2.0) ** 2
     )
-    return 2.0 * EARTH_RADIUS_KM * math.asin(math.sqrt(min(haversine, 1.0))) <= area.reach_km
+    return 2.0 * EARTH_RADIUS_KM * math.asin(math.sqrt(min(haversine, 1.0))) <= _reach_km(area)
 
 
-def quadkeys(area: Area) -> list[str]:
+def quadkeys(area: Circle) -> list[str]:
     """Level 9 tiles that the circle touches, across the 180th meridian too."""
     south, north, width = _spans(area)
     west, east = area.longitude_deg - width, area.longitude_deg + width
@@ -138,7 +123,7 @@ def quadkeys(area: Area) -> list[str]:
     return sorted({str(mercantile.quadkey(tile)) for tile in tiles if _touches(area, tile)})
 
 
-def part_of(area: Area, quadkey: str) -> Box:
+def part_of(area: Circle, quadkey: str) -> Box:
     """The part of a tile inside the box around the circle."""
     south, north, width = _spans(area)
     bounds, west = _offset(area, mercantile.quadkey_to_tile(quadkey))
@@ -223,7 +208,7 @@ def _folder(path: Path) -> None:
 
 
 def fetch_microsoft(
-    area: Area, folder: Path, index_url: str, config: HttpConfig, progress: Progress
+    area: Circle, folder: Path, index_url: str, config: HttpConfig, progress: Progress
 ) -> list[Fetched]:
     """Microsoft's files for the area, in ``folder``.
 
@@ -309,7 +294,7 @@ def _overture_errors() -> Iterator[None]:
         raise FetchError(f"Overture: {line}; check that this machine is online, then {AGAIN}") from error
 
 
-def fetch_overture(area: Area, folder: Path, client: OvertureClient, progress: Progress) -> list[Fetched]:
+def fetch_overture(area: Circle, folder: Path, client: OvertureClient, progress: Progress) -> list[Fetched]:
     """Overture's newest buildings of the area as GeoParquet, one file for each level 9 tile with buildings.
 
     A tile is the unit that is not fetched again; a tile that was interrupted begins anew.

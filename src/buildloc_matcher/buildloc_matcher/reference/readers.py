@@ -241,7 +241,7 @@ class _Gdal:
             self._layer = self._polygon_layer()
             info = pyogrio.read_info(self._source, layer=self._layer)
         self.crs = None if info["crs"] is None else CRS.from_user_input(info["crs"])
-        self._bounds = info["total_bounds"]
+        self._bounds = info["total_bounds"] and _union([info["total_bounds"]])  # GDAL may say infinity
         self._has_geometry = info["geometry_type"] is not None
         self.licence = _stated_licence(info["layer_metadata"], info["dataset_metadata"])
 

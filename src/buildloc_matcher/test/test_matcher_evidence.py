@@ -1,0 +1,121 @@
+"""Evidence of what lies around a seed, against chance."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from buildloc_matcher.descriptors import describe
+from buildloc_matcher.evidence import (
+    HOPELESS,
+    NEIGHBOURS,
+    NO_MATCH,
+    WITNESSES,
+    ground,
+    placed_evidence,
+    query_map,
+    seed_evidence,
+    witnesses,
+)
+from buildloc_matcher.geometry import rotation
+from buildloc_msgs_py.types import FloatArray
+from towns import DEFAULT, lattice, strip, town
+
+CITY = town(61, 4000, 1900.0)  # 30 m apart on average
+GROUND = ground(CITY.centroids_m)
+SEEN = strip(CITY, 900.0, 70.0)
+TURN = rotation(2.5)
+TRIANGLES = describe(SEEN.centroids_m, SEEN.areas_m2, SEEN.shapes).vertices.astype(np.int64)
+
+
+def as_map(points_m: FloatArray, sigma_m: float = 0.0) -> FloatArray:
+    """In a frame of its own, with errors."""
+    noise = np.random.default_rng(1).normal(0.0, sigma_m, points_m.shape)
+    return (points_m - points_m.mean(axis=0)) @ TURN.T + noise
+
+
+def evidence(query_m: FloatArray, triangles: np.ndarray, places_m: FloatArray) -> FloatArray:
+    seeds = np.arange(len(triangles))
+    return seed_evidence(query_map(query_m), triangles, seeds, places_m, GROUND, DEFAULT)
+
+
+@pytest.mark.parametrize("sigma_m", [0.0, 1.0])
+def test_true_seeds_have_more_than_chance(sigma_m: float) -> None:
+    query = as_map(SEEN.centroids_m, sigma_m)
+    true = evidence(query, TRIANGLES, SEEN.centroids_m[TRIANGLES])
+    # The same triangles laid on corners somewhere else: the shapes fit, the surroundings do not.
+    moved = as_map(SEEN.centroids_m) @ TURN + SEEN.centroids_m.mean(axis=0) + (37.0, 411.0)
+    wrong = evidence(query, TRIANGLES, moved[TRIANGLES])
+    assert len(true) > 150
+    assert np.quantile(true, 0.1) > 20.0 > 0.0 > np.quantile(wrong, 0.9)
+    assert np.all(wrong > HOPELESS - 10.0)  # one that sinks is given up
+
+
+def test_more_witnesses_are_more_evidence() -> None:
+    middle = int(
+        np.argmin(np.abs(SEEN.centroids_m[TRIANGLES].mean(axis=1) - SEEN.centroids_m.mean(axis=0)).sum(1))
+    )
+    corners = TRIANGLES[middle]
+    others = witnesses(SEEN.centroids_m, corners[None])[0]
+    nats = []
+    for count in range(1, WITNESSES + 1):
+        kept = np.concatenate([corners, others[:count]])
+        some = as_map(SEEN.centroids_m)[kept]
+        nats.append(evidence(some, np.array([[0, 1, 2]]), SEEN.centroids_m[corners][None])[0])
+    # Each lies where it is predicted; by chance a building does so within a metre once in 300 times.
+    assert np.all(np.diff(nats) > 1.0) and nats[0] > 1.0
+    (everything,) = evidence(as_map(SEEN.centroids_m), corners[None], SEEN.centroids_m[corners][None])
+    assert everything == pytest.approx(nats[-1], rel=1e-6)
+
+
+def test_a_building_that_is_missing_costs_less_than_one_that_is_found_gains() -> None:
+    corners = TRIANGLES[len(TRIANGLES) // 2]
+    query = as_map(SEEN.centroids_m)
+    (whole,) = evidence(query, corners[None], SEEN.centroids_m[corners][None])
+    last = witnesses(query, corners[None])[0][-1]
+    hole = np.flatnonzero(np.hypot(*(CITY.centroids_m - SEEN.centroids_m[last]).T) > 30.0)
+    without = seed_evidence(
+        query_map(query), corners[None], np.zeros(1, dtype=np.int64), SEEN.centroids_m[corners][None],
+        ground(CITY.centroids_m[hole]), DEFAULT,
+    )[0]  # fmt: skip
+    assert 0.0 < without < whole
+
+
+def test_a_map_laid_where_it_belongs_and_elsewhere() -> None:
+    here = SEEN.centroids_m
+    assert placed_evidence(here, GROUND, DEFAULT) > 3.0 * len(here)
+    for shift in ((300.0, 0.0), (0.0, -250.0), (20.0, 20.0)):
+        assert placed_evidence(here + shift, GROUND, DEFAULT) < 0.0
+    far = placed_evidence(here + 1e5, GROUND, DEFAULT)
+    # Nothing there: each building was seen in the reference with a probability of 0.7, up to 3 sigma.
+    assert far == pytest.approx(len(here) * math.log(1.0 - 0.7 * (1.0 - math.exp(-4.5))))
+
+
+def test_the_density_is_that_of_the_surroundings() -> None:
+    block = ground(lattice(40, 40, 25.0).centroids_m)
+    # 1 in 625 m2, in cells of 100 m that hold four rows of four.
+    assert block.density_per_m2[3:6, 3:6] == pytest.approx(1.0 / 625.0)
+    assert np.all(block.density_per_m2 > 0.0)
+    lonely = ground(np.array([[0.0, 0.0], [2000.0, 2000.0]])).density_per_m2
+    assert lonely[10, 10] == 2e-5
+
+
+def test_neighbours_and_witnesses_are_the_nearest_others() -> None:
+    points = SEEN.centroids_m
+    distances = np.hypot(*(points[:, None] - points[None]).transpose(2, 0, 1))
+    expected = np.argsort(distances, axis=1)[:, 1 : NEIGHBOURS + 1]
+    np.testing.assert_array_equal(query_map(points).neighbours, expected)
+    near = witnesses(points, TRIANGLES[:5])
+    for corners, others in zip(TRIANGLES[:5], near, strict=True):
+        apart = np.hypot(*(points - points[corners].mean(axis=0)).T)
+        apart[corners] = np.inf
+        assert others.tolist() == np.argsort(apart)[:WITNESSES].tolist()
+
+
+def test_small_maps_have_fewer_neighbours_and_padded_witnesses() -> None:
+    five = SEEN.centroids_m[:5]
+    assert query_map(five).neighbours.shape == (5, 4)
+    near = witnesses(five, np.array([[0, 1, 2]]))
+    assert set(near[0, :2].tolist()) == {3, 4} and np.all(near[0, 2:] == NO_MATCH)
+    assert witnesses(five, np.empty((0, 3), dtype=np.int64)).shape == (0, WITNESSES)

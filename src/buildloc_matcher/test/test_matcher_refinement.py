@@ -1,0 +1,135 @@
+"""The refinement of the last frames recovers a known shift and turn; fits of known motions."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from buildloc_matcher.config import matcher_config
+from buildloc_matcher.evidence import ground
+from buildloc_matcher.geometry import Similarity, fit_rigid, fit_similarity, rotation, wrap
+from buildloc_matcher.refinement import covariance_enu, horizontal_variance, observed_in_world, refine
+from buildloc_msgs_py.types import FloatArray, FrameObservation, Keyframe
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from towns import DEFAULT, town
+
+SECOND = 10**9
+CITY = town(91, 900, 900.0, origin_m=(0.0, 0.0)).centroids_m
+GROUND = ground(CITY)
+POSES = [Keyframe(i * SECOND, 200.0 + 20.0 * i, 400.0 + 5.0 * i, 0.3 * i) for i in range(1, 21)]
+
+
+def frames_of(poses: list[Keyframe], noise_m: float = 0.3, seed: int = 1) -> list[FrameObservation]:
+    """What each pose sees of the city within 110 m, in its level camera frame."""
+    rng = np.random.default_rng(seed)
+    seen = []
+    for pose in poses:
+        level = (CITY - [pose.x_m, pose.y_m]) @ rotation(pose.yaw_rad)
+        level = level[np.hypot(*level.T) < 110.0]
+        seen.append(FrameObservation(pose.stamp_ns, level + rng.normal(0.0, noise_m, level.shape), 105.0))
+    return seen
+
+
+SEEN = frames_of(POSES)
+LAST = np.array([POSES[-1].x_m, POSES[-1].y_m])
+
+
+def coarse(x_m: float, y_m: float, turn_deg: float) -> Similarity:
+    """The truth moved and turned around the last pose."""
+    anchor = (float(LAST[0]), float(LAST[1]))
+    return Similarity(anchor, (anchor[0] + x_m, anchor[1] + y_m), math.radians(turn_deg))
+
+
+@settings(max_examples=25, deadline=None)
+@given(heading=st.floats(-3.2, 3.2), away=st.floats(0.0, 8.0), turn=st.floats(-1.5, 1.5))
+def test_a_shift_and_a_turn_are_recovered(heading: float, away: float, turn: float) -> None:
+    # 8 m and 1.5 degrees over 380 m: within the 15 m in which the nearest building is mostly the right one.
+    start = coarse(away * math.cos(heading), away * math.sin(heading), turn)
+    refined = refine(start, POSES, SEEN, GROUND, DEFAULT)
+    assert refined is not None
+    # Noise of 0.3 m, averaged over hundreds of pairs.
+    np.testing.assert_allclose(refined.position_m, LAST, atol=0.5)
+    assert float(wrap(refined.yaw_rad - POSES[-1].yaw_rad)) == pytest.approx(0.0, abs=0.005)
+    assert refined.rms_m < 1.0 and refined.pairs > 0.9 * refined.observed
+    assert refined.buildings <= refined.pairs <= refined.observed == sum(len(s.centroids_m) for s in SEEN)
+
+
+def test_the_paper_reaches_further() -> None:
+    config = matcher_config({"preset": "paper"})
+    assert (config.refine_distance_m, config.refine_frames) == (50.0, 20)
+    refined = refine(coarse(4.0, -3.0, 0.5), POSES, SEEN, GROUND, config)
+    assert refined is not None
+    # Wrong pairs within 15 m stay in the last step and pull a little.
+    np.testing.assert_allclose(refined.position_m, LAST, atol=1.5)
+
+
+def test_only_the_last_frames_with_a_pose_count() -> None:
+    few = replace(DEFAULT, refine_frames=5)
+    refined = refine(coarse(2.0, 1.0, 0.2), POSES, SEEN, GROUND, few)
+    assert refined is not None and refined.observed == sum(len(s.centroids_m) for s in SEEN[-5:])
+    stray = [FrameObservation(99 * SECOND, np.zeros((50, 2)), 105.0), *SEEN[::-1]]
+    again = refine(coarse(2.0, 1.0, 0.2), POSES[::-1], stray, GROUND, few)
+    assert again is not None
+    np.testing.assert_allclose(again.position_m, refined.position_m, atol=1e-9)
+
+
+def test_frames_lie_in_the_world_where_the_coarse_pose_puts_them() -> None:
+    placed = observed_in_world(coarse(0.0, 0.0, 0.0), POSES, frames_of(POSES, 0.0), 20)
+    apart = np.hypot(*(placed[:, None] - CITY[None]).transpose(2, 0, 1)).min(axis=1)
+    assert len(placed) > 500 and apart.max() < 1e-9
+    assert observed_in_world(coarse(0, 0, 0), POSES, [], 20).shape == (0, 2)
+
+
+def test_what_gives_no_refined_pose() -> None:
+    start = coarse(1.0, 1.0, 0.0)
+    assert refine(start, [], SEEN, GROUND, DEFAULT) is None
+    assert refine(start, POSES, [], GROUND, DEFAULT) is None
+    two = [FrameObservation(SEEN[-1].stamp_ns, SEEN[-1].centroids_m[:2], 105.0)]
+    assert refine(start, POSES, two, GROUND, DEFAULT) is None
+    assert refine(start, POSES, SEEN, ground(CITY + 5000.0), DEFAULT) is None
+    one_house = ground(np.array([[9e3, 9e3], LAST]))
+    assert refine(start, POSES, SEEN[-1:], one_house, DEFAULT) is None
+
+
+def test_the_covariance_is_never_better_than_its_floor_and_grows_with_the_lever() -> None:
+    refined = refine(coarse(1.0, 1.0, 0.1), POSES, SEEN, GROUND, DEFAULT)
+    assert refined is not None
+    covariance = covariance_enu(refined, DEFAULT)
+    assert np.all(np.diag(covariance)[:2] == DEFAULT.sigma_floor_m**2)
+    assert covariance[2, 2] == DEFAULT.sigma_up_m**2 and np.count_nonzero(covariance) == 3
+    square = np.array([[-10.0, -10.0], [10.0, -10.0], [10.0, 10.0], [-10.0, 10.0]])
+    # 4 buildings, residuals of 4 m: 16 / 2 times (1 + lever^2 / 200), times the inflation of 2 squared.
+    for lever, expected in ((0.0, 32.0), (20.0, 96.0)):
+        variance = horizontal_variance(np.array([lever, 0.0]), square, 4.0, DEFAULT)
+        assert variance == pytest.approx(expected)
+    assert horizontal_variance(np.zeros(2), square, 0.1, DEFAULT) == DEFAULT.sigma_floor_m**2
+
+
+@settings(max_examples=50, deadline=None)
+@given(yaw=st.floats(-3.1, 3.1), x=st.floats(-1e6, 1e6), y=st.floats(-1e6, 1e6), scale=st.floats(0.86, 1.14))
+def test_fits_recover_known_motions(yaw: float, x: float, y: float, scale: float) -> None:
+    points = CITY[:20]
+    rigid = Similarity((10.0, 20.0), (x, y), yaw)
+    moved = rigid.apply(points)
+    np.testing.assert_allclose(fit_rigid(points, moved).apply(points), moved, atol=1e-6)
+    similar = replace(rigid, scale=scale)
+    found = fit_similarity(points, similar.apply(points), 0.15)
+    assert found.scale == pytest.approx(scale) and found.yaw_rad == pytest.approx(yaw, abs=1e-6)
+    held = fit_similarity(points, replace(rigid, scale=1.5).apply(points), 0.15)
+    assert held.scale == 1.15
+
+
+def test_weights_decide_between_two_motions() -> None:
+    points: FloatArray = CITY[:20]
+    target = np.concatenate([np.add(points[:10], (5.0, 0.0)), np.add(points[10:], (0.0, 90.0))])
+    weights = np.r_[np.ones(10), np.full(10, 1e-9)]
+    np.testing.assert_allclose(fit_rigid(points, target, weights).apply(points[:10]), target[:10], atol=1e-3)
+
+
+def test_a_mirror_image_is_fitted_by_a_turn() -> None:
+    points = CITY[:20]
+    turn = rotation(fit_rigid(points, points * [-1.0, 1.0]).yaw_rad)
+    assert np.linalg.det(turn) == pytest.approx(1.0)
