@@ -44,7 +44,7 @@ BARS = {
     "mirafiori_translation_p90_m": 0.2,
     "mirafiori_yaw_median_deg": 0.1,
     "mirafiori_trajectory_rmse_m": 0.3,
-    "sheffield_images_in_one_map": 172,
+    "sheffield_images_in_one_map": 172,  # all; fewer in a quick run
     "sheffield_trajectory_rmse_m": 3.0,
 }
 OF_PAIRS = (
@@ -317,8 +317,9 @@ def reached(flights: dict[str, dict[str, Any]]) -> dict[str, Any]:
         "sheffield_trajectory_rmse_m": tilted["mapper"].get("rmse_m"),
     }
     answers = {}
-    for name, bar in BARS.items():
+    for name, wanted in BARS.items():
         value = measured[name]
+        bar = min(wanted, tilted["images"]) if name == "sheffield_images_in_one_map" else wanted
         held = value is not None and (value >= bar if isinstance(bar, int) else value <= bar)
         answers[name] = {"bar": bar, "measured": value, "held": held}
     return answers
