@@ -142,6 +142,22 @@ def test_a_parameter_out_of_range_is_named_with_its_range(
     refused([*arguments, "--set", "mapper_node.features=7"], text, capfd, recwarn)
 
 
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["--registration", "orb"], "parameter registration = 'orb' is unknown; choose sift, xfeat"),
+        (["--registration", "xfeat"], "registration xfeat needs weights"),
+        (["--registration", "xfeat", "--registration-model", "none.onnx"], "none.onnx: no such ONNX file"),
+    ],
+)
+def test_a_registration_that_cannot_be_had(
+    options: list[str], text: str, folder: Path, tmp_path: Path,
+    capfd: pytest.CaptureFixture[str], recwarn: pytest.WarningsRecorder,
+) -> None:  # fmt: skip
+    out = str(tmp_path / "map.geojson")
+    refused(["map", str(folder / "bag"), "--out", out, *options], text, capfd, recwarn)
+
+
 def test_some_unusable_images_are_one_warning_and_no_error(
     folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

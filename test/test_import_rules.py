@@ -27,8 +27,11 @@ MAY_IMPORT_ROS = re.compile(
     r"|buildloc\.(replay|fix_listener)"
     r"|buildloc\.launch\..+"
 )
-# One module for each network, and one for the pose graph.
-ONLY_IN = {"onnxruntime": {"buildloc_segmenter.network"}, "gtsam": {"buildloc_mapper.pose_graph"}}
+# One module for the segmentation network, one for all matching networks, and one for the pose graph.
+ONLY_IN = {
+    "onnxruntime": {"buildloc_segmenter.network", "buildloc_mapper.network"},
+    "gtsam": {"buildloc_mapper.pose_graph"},
+}
 WORLD_SIMULATION = {f"buildloc_eval.{name}" for name in ("world", "town", "flight", "camera", "sim")}
 NAMES_GROUND_TRUTH = {"buildloc_msgs_py.topics"}  # where the topic is spelt
 NODE_LINES = 160
@@ -143,6 +146,7 @@ def test_world_simulation_never_reaches_the_matcher() -> None:
         ("buildloc_matcher.session", "from sensor_msgs.msg import Image"),
         ("buildloc.cli", "from std_srvs.srv import Trigger"),
         ("buildloc_segmenter.keyframes", "import onnxruntime"),
+        ("buildloc_mapper.xfeat", "import onnxruntime"),
         ("buildloc_mapper.fusion", "import gtsam"),
         ("buildloc_segmenter.segmenter_node", "import torch"),
         ("buildloc_matcher.session", "from buildloc_msgs_py import topics\nprint(topics.GROUND_TRUTH)"),

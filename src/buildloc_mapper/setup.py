@@ -24,6 +24,7 @@ setup(
         "opencv-python-headless>=4.8,<6",
         "shapely>=2.0,<3",
         "gtsam>=4.3,<5",
+        "onnxruntime>=1.18,<2",
     ],
     extras_require={"ros": ["buildloc_msgs_py[ros]"], "test": ["pytest"]},
     entry_points={

@@ -76,6 +76,14 @@ def _settings(args: argparse.Namespace) -> Settings:
     return load(args.config, [*preset, *args.overrides])
 
 
+def _registration(args: argparse.Namespace) -> list[str]:
+    """--registration and --registration-model as overrides of the mapper's parameters."""
+    from buildloc.settings import MAPPER
+
+    given = {"registration": args.registration, "registration_model": args.registration_model}
+    return [f"{MAPPER}.{name}={json.dumps(str(value))}" for name, value in given.items() if value is not None]
+
+
 def _progress(text: str) -> None:
     if sys.stderr.isatty():
         print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
@@ -215,7 +223,7 @@ def _map(args: argparse.Namespace) -> int:
     from buildloc.mapfile import write_map, write_tum
     from buildloc.settings import MAPPER, SEGMENTER, config_of, load
 
-    settings = load(args.config, args.overrides)
+    settings = load(args.config, [*_registration(args), *args.overrides])
     segmenter = Segmenter(config_of(settings, SEGMENTER, SegmenterConfig))
     mapper = Mapper(config_of(settings, MAPPER, MapperConfig))
     update = None
@@ -400,6 +408,8 @@ def parser() -> argparse.ArgumentParser:
             commands, "map", "map file and trajectory of a bag", _map, bag,
             _argument("--out", type=Path, required=True, help="GeoJSON or GeoParquet, local metres"),
             _argument("--trajectory", type=Path, help="keyframe poses in TUM format"),
+            _argument("--registration", metavar="NAME", help="sift, xfeat, coarse_loftr or loftr"),
+            _argument("--registration-model", type=Path, help="ONNX file of its weights; none for sift"),
         ),
         _command(
             commands, "locate", "ranked candidates and fix of a map file", _locate,

@@ -141,7 +141,7 @@ def run_demo(args: argparse.Namespace) -> int:
 
 def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `buildloc eval`."""
-    parser.add_argument("name", choices=["barnarp", "scale"], help="which evaluation")
+    parser.add_argument("name", choices=["barnarp", "mapping", "scale"], help="which evaluation")
     parser.add_argument("--out", type=Path, required=True, help="folder for report.json and report.html")
     parser.add_argument("--seed", type=int, default=1, help="seed of the flight")
     parser.add_argument("--quick", action="store_true", help="a part of it, in less than five minutes")
@@ -156,6 +156,10 @@ def run_eval(args: argparse.Namespace) -> int:
         from buildloc_eval import scale
 
         print(scale.evaluate(args.out, args.seed, args.quick, _stage))
+    elif args.name == "mapping":
+        from buildloc_eval import mapping
+
+        print(mapping.evaluate(args.out, args.seed, args.quick, _stage))
     else:
         from buildloc_eval import barnarp
 

@@ -18,6 +18,7 @@ LIBRARIES = (
     "opencv-python-headless",
     "onnxruntime",
     "gtsam",
+    "evo",
 )
 
 

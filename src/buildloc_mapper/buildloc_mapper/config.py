@@ -11,12 +11,19 @@ from buildloc_msgs_py.config import param
 class MapperConfig:
     """Parameters of frame registration, pose graph, mask fusion and footprint extraction."""
 
-    features: int = param(2000, "SIFT features per keyframe", 50, 20000)
-    feature_width_px: int = param(960, "images wider than this are shrunk before SIFT, px", 100, 10000)
+    registration: str = param("sift", "matching method: sift, xfeat, coarse_loftr or loftr")
+    registration_model: str = param("", "ONNX file of the matching method's weights; none for sift")
+    level_width_px: int = param(960, "images wider than this are shrunk when made level, px", 100, 10000)
+    features: int = param(2000, "features per keyframe", 50, 20000)
+    feature_width_px: int = param(640, "level images wider than this are shrunk before SIFT, px", 100, 10000)
     match_ratio: float = param(0.8, "nearest to second-nearest descriptor distance (ratio test)", 0.1, 1.0)
     ransac_threshold_m: float = param(1.0, "inlier distance of the RANSAC similarity, m", 0.01, 100.0)
+    refined_threshold_px: float = param(2.5, "inlier distance after sub-pixel refinement, px", 0.1, 100.0)
     min_inliers: int = param(20, "fewest RANSAC inliers of an accepted pair", 3, 10000)
     max_scale_deviation: float = param(0.15, "largest deviation of a pair's metric scale from 1", 0.001, 0.9)
+    max_yaw_deviation_deg: float = param(
+        180.0, "largest deviation of a pair's turn from the gimbal's, deg; 180: not compared", 0.1, 180.0
+    )
     fallback_keyframes: int = param(3, "earlier keyframes tried when the previous one fails", 0, 100)
     max_lost: int = param(3, "keyframes in a row without a link before the map starts anew", 1, 1000)
     loop_radius_m: float = param(40.0, "keyframes nearer than this are tested as loop closures, m", 0.0, 1e4)

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from buildloc_msgs_py.errors import BuildlocError
-from buildloc_msgs_py.ground import camera_matrix, level_matrix, pixels_to_level
+from buildloc_msgs_py.ground import border, level_to_ray, pixels_to_level, resample
 from buildloc_msgs_py.types import ByteArray, CameraModel, FloatArray
 from numpy.typing import NDArray
 
 from buildloc_mapper.config import MapperConfig
-from buildloc_mapper.registration import Similarity
+from buildloc_mapper.similarity import Similarity
 
 MAX_CANVAS_PX = 400_000_000
 
@@ -28,17 +28,9 @@ class View:
     altitude_m: float
     attitude_xyzw: tuple[float, float, float, float]
 
-    def corners_m(self) -> FloatArray:
-        """(4, 2) corners of the image in the level camera frame."""
-        w, h = self.camera.width - 0.5, self.camera.height - 0.5
-        uv = np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h]])
-        return pixels_to_level(uv, self.camera, self.altitude_m, self.attitude_xyzw)
-
-    def level_to_pixels(self) -> FloatArray:
-        """(3, 3) homography from level metres (x, y, 1) to pixels."""
-        to_ray = np.diag([1.0, -1.0, self.altitude_m])
-        level = level_matrix(self.attitude_xyzw)
-        return np.asarray(camera_matrix(self.camera) @ level.T @ to_ray, dtype=np.float64)
+    def edge_m(self) -> FloatArray:
+        """(N, 2) outer edge of the image in the level camera frame."""
+        return pixels_to_level(border(self.camera), self.camera, self.altitude_m, self.attitude_xyzw)
 
 
 @dataclass(frozen=True)
@@ -72,8 +64,8 @@ def _map_to_level(pose: Similarity) -> FloatArray:
 def fuse(views: Sequence[View], poses: Sequence[Similarity], config: MapperConfig) -> FusedMap:
     """Warp every mask to the map and count. Raises BuildlocError when the map is impossibly large."""
     gsd = config.map_gsd_m
-    corners = [pose.apply(view.corners_m()) for view, pose in zip(views, poses, strict=True)]
-    low, high = np.vstack(corners).min(axis=0), np.vstack(corners).max(axis=0)
+    edges = [pose.apply(view.edge_m()) for view, pose in zip(views, poses, strict=True)]
+    low, high = np.vstack(edges).min(axis=0), np.vstack(edges).max(axis=0)
     left, top = float(low[0]), float(high[1])
     width, height = (int(v) + 1 for v in np.ceil((high - low) / gsd))
     if width * height > MAX_CANVAS_PX:
@@ -82,19 +74,18 @@ def fuse(views: Sequence[View], poses: Sequence[Similarity], config: MapperConfi
         )
     seen = np.zeros((height, width), dtype=np.uint16)
     building = np.zeros_like(seen)
-    for view, pose, quad in zip(views, poses, corners, strict=True):
-        c0, r0 = np.floor([(quad[:, 0].min() - left) / gsd, (top - quad[:, 1].max()) / gsd]).astype(int)
-        c1, r1 = np.ceil([(quad[:, 0].max() - left) / gsd, (top - quad[:, 1].min()) / gsd]).astype(int)
+    for view, pose, edge in zip(views, poses, edges, strict=True):
+        c0, r0 = np.floor([(edge[:, 0].min() - left) / gsd, (top - edge[:, 1].max()) / gsd]).astype(int)
+        c1, r1 = np.ceil([(edge[:, 0].max() - left) / gsd, (top - edge[:, 1].min()) / gsd]).astype(int)
         pixel_to_map = np.array(
             [[gsd, 0.0, left + (c0 + 0.5) * gsd], [0.0, -gsd, top - (r0 + 0.5) * gsd], [0, 0, 1.0]]
         )
-        homography = view.level_to_pixels() @ _map_to_level(pose) @ pixel_to_map
+        to_ray = level_to_ray(view.altitude_m, view.attitude_xyzw) @ _map_to_level(pose) @ pixel_to_map
         size = (int(c1 - c0), int(r1 - r0))
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         window = np.s_[r0:r1, c0:c1]
         footprint = np.zeros((int(r1 - r0), int(c1 - c0)), dtype=np.uint8)
-        outline = (quad - (left + c0 * gsd, top - r0 * gsd)) * [1.0, -1.0] / gsd - 0.5
-        cv2.fillConvexPoly(footprint, np.round(outline * 16).astype(np.int32), 1, cv2.LINE_8, 4)
+        outline = (edge - (left + c0 * gsd, top - r0 * gsd)) * [1.0, -1.0] / gsd - 0.5
+        cv2.fillPoly(footprint, [np.round(outline * 16).astype(np.int32)], 1, cv2.LINE_8, 4)
         seen[window] += footprint
-        building[window] += np.asarray(cv2.warpPerspective(view.mask, homography, size, flags=flags)) > 127
+        building[window] += resample(view.mask, view.camera, to_ray, size) > 127
     return FusedMap(left, top, gsd, seen, building)

@@ -16,7 +16,8 @@ from buildloc_mapper.config import MapperConfig
 from buildloc_mapper.extraction import LocalOutlines, extract_buildings
 from buildloc_mapper.fusion import View, fuse
 from buildloc_mapper.pose_graph import Edge, optimize
-from buildloc_mapper.registration import Features, Link, Similarity, extract, register
+from buildloc_mapper.registration import Link, Prepared, Registration
+from buildloc_mapper.similarity import Similarity
 
 ORIGIN = Similarity(0.0, 0.0, 0.0, 1.0)
 
@@ -38,7 +39,7 @@ class MapUpdate:
 @dataclass(frozen=True)
 class _Node:
     stamp_ns: int
-    features: Features
+    prepared: Prepared
     view: View
 
 
@@ -48,6 +49,7 @@ class Mapper:
     def __init__(self, config: MapperConfig) -> None:
         check(config)
         self.config = config
+        self._registration = Registration(config)
         self.reset()
 
     def reset(self) -> None:
@@ -73,7 +75,7 @@ class Mapper:
             raise MapperError("mask and image differ in stamp or size; feed the segmenter's own masks")
         started = time.perf_counter()
         view = View(mask.pixels, frame.camera, frame.altitude_m, frame.attitude_xyzw)
-        node = _Node(frame.stamp_ns, extract(frame, self.config), view)
+        node = _Node(frame.stamp_ns, self._registration.prepare(frame), view)
         if not self._attach(node):
             return None
         self._close_loops()
@@ -97,7 +99,7 @@ class Mapper:
         return MapUpdate(keyframes, found.local_map, found.outlines, funnel)
 
     def _link(self, earlier: int, node: _Node, loop: bool = False) -> bool:
-        link = register(self._nodes[earlier].features, node.features, self.config)
+        link = self._registration.register(self._nodes[earlier].prepared, node.prepared)
         if not isinstance(link, Link):
             self._rejected[("loop_" if loop else "") + link.reason] += 1
             return False

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from buildloc_mapper.config import MapperConfig
-from buildloc_mapper.registration import Similarity
+from buildloc_mapper.similarity import Similarity
 
 FREE = 1e4  # metres or radians: a prior this wide says nothing
 FIXED = 1e-6

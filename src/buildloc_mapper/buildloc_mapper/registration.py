@@ -1,112 +1,201 @@
-"""Registers two keyframes: SIFT correspondences on the ground and a RANSAC similarity (map stitching)."""
+"""Registers two keyframes: correspondences on level ground, a robust similarity, refined below the pixel."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
-from buildloc_msgs_py.ground import pixels_to_level
-from buildloc_msgs_py.types import FloatArray, Frame
+from buildloc_msgs_py.config import ConfigError
+from buildloc_msgs_py.types import ByteArray, FloatArray, Frame
 from numpy.typing import NDArray
 
 from buildloc_mapper.config import MapperConfig
+from buildloc_mapper.level import LevelImage, level_image
+from buildloc_mapper.matching import Matches, Method, Sift
+from buildloc_mapper.similarity import Similarity, fit_similarity
+from buildloc_mapper.subpixel import corners, track
 
+METHODS = ("sift", "xfeat", "coarse_loftr", "loftr")
 MIN_MATCHES = 3
-
-
-class Similarity(NamedTuple):
-    """p_to = translation + scale R(yaw) p_from; metres, radians."""
-
-    x_m: float
-    y_m: float
-    yaw_rad: float
-    scale: float
-
-    def apply(self, points_m: FloatArray) -> FloatArray:
-        """(N, 2) -> (N, 2)."""
-        c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
-        rotation = np.array([[c, -s], [s, c]])
-        return np.asarray(self.scale * points_m @ rotation.T + (self.x_m, self.y_m), dtype=np.float64)
-
-    def compose(self, other: Similarity) -> Similarity:
-        """Apply ``other`` first, then this one."""
-        x, y = self.apply(np.array([[other.x_m, other.y_m]]))[0]
-        yaw = math.remainder(self.yaw_rad + other.yaw_rad, math.tau)
-        return Similarity(float(x), float(y), yaw, self.scale * other.scale)
+RELIEF = 0.1  # standard deviation of the ground's slope, trees and roofs among it
+MAJORITY = 0.5  # share of matches that must agree where tracking does not confirm them
+CELL_SPREAD = 1.0  # inlier distance of matched cells, in cells: both ends are right to half a cell
 
 
 @dataclass(frozen=True)
-class Features:
-    """Feature positions (N, 2) in the level camera frame, metres, and descriptors (N, 128)."""
+class Prepared:
+    """A frame as level ground, the corners (N, 2) px it can be refined by, and the method's features."""
 
-    points_m: FloatArray
-    descriptors: NDArray[np.float32]
+    level: LevelImage
+    corners_uv: FloatArray
+    features: Any
 
 
 @dataclass(frozen=True)
 class Link:
-    """Relative pose of a keyframe in an earlier one, in metres, and its RANSAC inliers.
+    """Relative pose of a keyframe in an earlier one, in metres, and how many matches agree with it.
 
-    Features are already metric by their own altitudes, so the altitude ratio of the pair is divided
-    out: the scale is 1 up to errors of altitude and terrain.
+    Images are already metric by their own altitudes, so the altitude ratio of the pair is divided out: the
+    scale is 1 up to errors of altitude and terrain. ``covariance`` (4, 4) is that of the fit, over x, y,
+    yaw, log scale; errors of telemetry are not in it.
     """
 
     transform: Similarity
     inliers: int
+    covariance: FloatArray
 
 
 @dataclass(frozen=True)
 class Rejection:
-    """Why a pair was not linked: ``few_matches``, ``few_inliers`` or ``scale``."""
+    """Why a pair was not linked: ``few_matches``, ``few_inliers``, ``scale`` or ``yaw``."""
 
     reason: str
 
 
-def extract(frame: Frame, config: MapperConfig) -> Features:
-    """SIFT features of a frame, put on the ground by altitude and tilt."""
-    grey = cv2.cvtColor(frame.image_bgr, cv2.COLOR_BGR2GRAY)
-    shrink = min(1.0, config.feature_width_px / grey.shape[1])
-    if shrink < 1.0:
-        grey = cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-    keypoints, descriptors = cv2.SIFT.create(nfeatures=config.features).detectAndCompute(grey, None)
-    if descriptors is None:
-        return Features(np.empty((0, 2)), np.empty((0, 128), dtype=np.float32))
-    # Pixel centres are whole numbers, so shrinking maps u to (u + 0.5) shrink - 0.5.
-    uv = (np.array([k.pt for k in keypoints]) + 0.5) / shrink - 0.5
-    points = pixels_to_level(uv, frame.camera, frame.altitude_m, frame.attitude_xyzw)
-    return Features(points, np.asarray(descriptors, dtype=np.float32))
+def create_method(config: MapperConfig) -> Method:
+    """The matching method that the config names. Raises BuildlocError: unknown, or weights that are none."""
+    if config.registration not in METHODS:
+        raise ConfigError(
+            f"parameter registration = {config.registration!r} is unknown; choose {', '.join(METHODS)}"
+        )
+    if config.registration == "sift":
+        return Sift(config.features, config.feature_width_px, config.match_ratio)
+    # onnxruntime is loaded for the networks alone.
+    if config.registration == "xfeat":
+        from buildloc_mapper.xfeat import XFeat
+
+        return XFeat(config.registration_model, config.features)
+    if config.registration == "coarse_loftr":
+        from buildloc_mapper.coarse_loftr import CoarseLoftr
+
+        return CoarseLoftr(config.registration_model)
+    from buildloc_mapper.loftr import Loftr
+
+    return Loftr(config.registration_model)
 
 
-def correspondences(one: Features, other: Features, ratio: float) -> NDArray[np.int64]:
-    """(M, 2) indices of matches from ``one`` to ``other`` that pass the ratio test, one to one."""
-    if len(one.points_m) < 2 or len(other.points_m) < 2:
-        return np.empty((0, 2), dtype=np.int64)
-    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(one.descriptors, other.descriptors, k=2)
-    kept = sorted((m.distance, m.queryIdx, m.trainIdx) for m, n in pairs if m.distance < ratio * n.distance)
-    taken: dict[int, int] = {}
-    for _, query, train in kept:
-        taken.setdefault(train, query)
-    return np.array([(q, t) for t, q in taken.items()], dtype=np.int64).reshape(-1, 2)
+class Registration:
+    """Frames prepared once, pairs of them registered. Raises BuildlocError for a method it cannot have."""
+
+    def __init__(self, config: MapperConfig) -> None:
+        self._config = config
+        self._method = create_method(config)
+
+    def prepare(self, frame: Frame) -> Prepared:
+        """Level ground and features of a frame."""
+        level = level_image(frame, self._config.level_width_px)
+        return Prepared(level, corners(level), self._method.prepare(level.grey))
+
+    def register(self, earlier: Prepared, later: Prepared) -> Link | Rejection:
+        """The later keyframe's pose in the earlier one, or why the pair is rejected."""
+        if min(len(earlier.corners_uv), len(later.corners_uv)) < self._config.min_inliers:
+            return Rejection("few_matches")
+        turned = _turn_told(earlier.level, later.level)
+        answers: list[Rejection] = []
+        for turn in sorted(self._method.turns, key=lambda turn: (turn - round(turned / (math.pi / 2))) % 4):
+            answer = self._estimate(earlier, later, self._matches(earlier, later, turn))
+            if isinstance(answer, Link):
+                return answer
+            answers.append(answer)
+        return answers[0]
+
+    def _matches(self, earlier: Prepared, later: Prepared, turn: int) -> Matches:
+        """Correspondences with the later image turned counter-clockwise by quarter turns."""
+        if turn == 0:
+            return self._method.match(earlier.features, later.features)
+        image, offset = turn_image(later.level.grey, turn)
+        found = self._method.match(earlier.features, self._method.prepare(image))
+        back = turn_back(found.later_uv - offset, turn, later.level.grey.shape)
+        return Matches(found.earlier_uv, back, found.cell_px)
+
+    def _estimate(self, earlier: Prepared, later: Prepared, matches: Matches) -> Link | Rejection:
+        config = self._config
+        seen = earlier.level.sees(matches.earlier_uv) & later.level.sees(matches.later_uv)
+        target = earlier.level.to_metres(matches.earlier_uv[seen])
+        source = later.level.to_metres(matches.later_uv[seen])
+        if len(source) < max(MIN_MATCHES, config.min_inliers):
+            return Rejection("few_matches")
+        cell_m = matches.cell_px * max(earlier.level.gsd_m, later.level.gsd_m)
+        threshold_m = max(config.ransac_threshold_m, CELL_SPREAD * cell_m)
+        rough, kept = robust_similarity(source, target, threshold_m)
+        count = int(kept.sum())
+        if count < config.min_inliers:
+            return Rejection("few_inliers")
+        if (wrong := self._implausible(rough, earlier.level, later.level)) is not None:
+            return wrong
+        fine = self._refine(earlier, later, rough)
+        if fine is None and (matches.cell_px > 0.0 or count < MAJORITY * len(source)):
+            return Rejection("few_inliers")  # too rough to be a measurement, or agreement by chance
+        source, target = fine or (source[kept], target[kept])
+        relief = RELIEF / earlier.level.altitude_m
+        transform, covariance = fit_similarity(source, target, np.array(rough[:2]), relief)
+        if (wrong := self._implausible(transform, earlier.level, later.level)) is not None:
+            return wrong
+        return Link(transform, count, covariance)
+
+    def _refine(
+        self, earlier: Prepared, later: Prepared, rough: Similarity
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """Tracked corners (N, 2) of the later and the earlier keyframe that lie on common ground; None
+        when there are too few."""
+        target, source = track(earlier.level, earlier.corners_uv, later.level, rough)
+        if len(source) < self._config.min_inliers:
+            return None
+        threshold_m = self._config.refined_threshold_px * earlier.level.gsd_m
+        _, kept = robust_similarity(source, target, threshold_m)
+        return (source[kept], target[kept]) if kept.sum() >= self._config.min_inliers else None
+
+    def _implausible(self, found: Similarity, earlier: LevelImage, later: LevelImage) -> Rejection | None:
+        """A transform that telemetry contradicts. The scale is what the two altitudes do not explain."""
+        if abs(found.scale - 1.0) > self._config.max_scale_deviation:
+            return Rejection("scale")
+        deviation = math.remainder(found.yaw_rad - _turn_told(earlier, later), math.tau)
+        if abs(deviation) > math.radians(self._config.max_yaw_deviation_deg):
+            return Rejection("yaw")
+        return None
 
 
-def register(earlier: Features, later: Features, config: MapperConfig) -> Link | Rejection:
-    """The later keyframe's pose in the earlier one, or why the pair is rejected."""
-    matches = correspondences(later, earlier, config.match_ratio)
-    if len(matches) < max(MIN_MATCHES, config.min_inliers):
-        return Rejection("few_matches")
-    source, target = later.points_m[matches[:, 0]], earlier.points_m[matches[:, 1]]
+def robust_similarity(
+    source_m: FloatArray, target_m: FloatArray, threshold_m: float
+) -> tuple[Similarity, NDArray[np.bool_]]:
+    """RANSAC similarity from ``source_m`` to ``target_m``, both (N, 2), and its (N,) inliers: none when
+    there is no similarity.
+
+    Plain RANSAC: OpenCV has MAGSAC for affine maps but not for similarities, and the two degrees more
+    follow the crowns of trees instead of the ground.
+    """
     affine, inliers = cv2.estimateAffinePartial2D(
-        source, target, method=cv2.RANSAC, ransacReprojThreshold=config.ransac_threshold_m,
+        source_m, target_m, method=cv2.RANSAC, ransacReprojThreshold=threshold_m,
         maxIters=5000, confidence=0.999, refineIters=20,
     )  # fmt: skip
-    count = 0 if affine is None else int(inliers.sum())
-    if affine is None or count < config.min_inliers:
-        return Rejection("few_inliers")
-    scale = math.hypot(affine[0, 0], affine[1, 0])
-    if abs(scale - 1.0) > config.max_scale_deviation:
-        return Rejection("scale")
-    yaw = math.atan2(affine[1, 0], affine[0, 0])
-    return Link(Similarity(float(affine[0, 2]), float(affine[1, 2]), yaw, scale), count)
+    if affine is None:
+        return Similarity(0.0, 0.0, 0.0, 1.0), np.zeros(len(source_m), dtype=bool)
+    yaw, scale = math.atan2(affine[1, 0], affine[0, 0]), math.hypot(affine[0, 0], affine[1, 0])
+    return Similarity(float(affine[0, 2]), float(affine[1, 2]), yaw, scale), inliers.ravel() > 0
+
+
+def _turn_told(earlier: LevelImage, later: LevelImage) -> float:
+    """Yaw of the later camera in the earlier one by the gimbal, radians, counter-clockwise."""
+    return earlier.heading_rad - later.heading_rad
+
+
+def turn_image(image: ByteArray, turn: int) -> tuple[ByteArray, tuple[int, int]]:
+    """The image turned counter-clockwise by quarter turns, cut and filled to the shape that it had, so that
+    networks see both images of a pair at one scale; and where (u, v) the turned image's first pixel lies."""
+    turned, (height, width) = np.rot90(image, turn), image.shape
+    left, top = (width - turned.shape[1]) // 2, (height - turned.shape[0]) // 2
+    canvas = np.full((height, width), round(float(image.mean())), dtype=np.uint8)
+    inner = turned[max(0, -top) : height - top, max(0, -left) : width - left]
+    row, column = max(0, top), max(0, left)
+    canvas[row : row + inner.shape[0], column : column + inner.shape[1]] = inner
+    return canvas, (left, top)
+
+
+def turn_back(uv: FloatArray, turn: int, shape: tuple[int, ...]) -> FloatArray:
+    """Pixels (N, 2) of ``np.rot90(image, turn)`` -> pixels of the image of this shape."""
+    (u, v), right, bottom = uv.T, shape[1] - 1, shape[0] - 1
+    back = {0: (u, v), 1: (right - v, u), 2: (right - u, bottom - v), 3: (v, bottom - u)}
+    return np.column_stack(back[turn % 4])

@@ -13,61 +13,10 @@ from buildloc_mapper.extraction import extract_buildings
 from buildloc_mapper.fusion import FusedMap, View, fuse
 from buildloc_mapper.mapper import Mapper, MapperError
 from buildloc_mapper.pose_graph import Edge, optimize
-from buildloc_mapper.registration import Link, Rejection, Similarity, extract, register
+from buildloc_mapper.similarity import Similarity
 from buildloc_msgs_py.config import ConfigError
-from buildloc_msgs_py.ground import camera_matrix, level_matrix
-from buildloc_msgs_py.types import ByteArray, CameraModel, Frame, Mask
-
-GSD = 0.2
-SIDE = 1200  # world of 240 m, origin at its centre, y up
-CAMERA = CameraModel(480, 360, 400.0, 400.0, 239.5, 179.5)
-LEVEL = (0.0, 0.0, 0.0, 1.0)
-BUILDINGS = [
-    (-40.0, -10.0, 14.0, 9.0),
-    (-5.0, 12.0, 10.0, 10.0),
-    (30.0, -8.0, 18.0, 8.0),
-    (55.0, 20.0, 9.0, 12.0),
-]
-
-
-def world() -> tuple[ByteArray, ByteArray]:
-    """Image (SIDE, SIDE, 3) and building mask of the plane."""
-    rng = np.random.default_rng(3)
-    noise = sum(
-        cv2.resize(rng.normal(size=(SIDE // k, SIDE // k)), (SIDE, SIDE), interpolation=cv2.INTER_CUBIC) * w
-        for k, w in ((4, 18.0), (12, 22.0), (40, 18.0))
-    )
-    grey = np.clip(110 + noise, 0, 255).astype(np.uint8)
-    mask = np.zeros((SIDE, SIDE), dtype=np.uint8)
-    for x, y, w, h in BUILDINGS:
-        c0, r0 = (round(v / GSD) for v in (x - w / 2 + SIDE * GSD / 2, SIDE * GSD / 2 - y - h / 2))
-        mask[r0 : r0 + int(h / GSD), c0 : c0 + int(w / GSD)] = 255
-    grey[mask > 0] = np.clip(grey[mask > 0].astype(int) + 60, 0, 255)
-    return np.repeat(grey[:, :, None], 3, axis=2), mask
-
-
-WORLD, WORLD_MASK = world()
-
-
-def tilt(roll_rad: float, pitch_rad: float) -> tuple[float, float, float, float]:
-    qx, qy = math.sin(roll_rad / 2), math.sin(pitch_rad / 2)
-    return qx, qy, 0.0, math.sqrt(1 - qx * qx - qy * qy)
-
-
-def shoot(
-    stamp: int, x: float, y: float, yaw: float, altitude: float = 60.0, attitude=LEVEL
-) -> tuple[Frame, Mask]:
-    """Frame and mask of a camera at (x, y) whose image-right points to ``yaw``."""
-    c, s = math.cos(yaw), math.sin(yaw)
-    to_world = np.array([[c, -s, x], [s, c, y], [0, 0, 1.0]])
-    to_pixel = np.array([[1 / GSD, 0, SIDE / 2 - 0.5], [0, -1 / GSD, SIDE / 2 - 0.5], [0, 0, 1.0]])
-    ray = camera_matrix(CAMERA) @ level_matrix(attitude).T @ np.diag([1.0, -1.0, altitude])
-    homography = to_pixel @ to_world @ np.linalg.inv(ray)
-    size, flags = (CAMERA.width, CAMERA.height), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    image = cv2.warpPerspective(WORLD, homography, size, flags=flags)
-    pixels = (cv2.warpPerspective(WORLD_MASK, homography, size, flags=flags) > 127).astype(np.uint8) * 255
-    return Frame(stamp, "camera", image, CAMERA, altitude, attitude), Mask(stamp, "camera", pixels)
-
+from buildloc_msgs_py.ground import camera_matrix
+from textured import BUILDINGS, LEVEL, shoot, tilt
 
 FLIGHT = [
     shoot(i, x, y, yaw, altitude, attitude)
@@ -83,33 +32,6 @@ FLIGHT = [
     )
 ]
 TRUTH = np.array([(-50.0, 0.0), (-30.0, 2.0), (-10.0, 4.0), (10.0, 2.0), (30.0, 4.0), (50.0, 6.0)])
-
-
-def test_register_recovers_the_relative_pose_through_altitude_and_tilt_changes() -> None:
-    config = MapperConfig()
-    link = register(extract(FLIGHT[0][0], config), extract(FLIGHT[1][0], config), config)
-    assert isinstance(link, Link)
-    c, s = math.cos(-0.3), math.sin(-0.3)
-    expected = np.array([[c, -s], [s, c]]) @ [20.0, 2.0]
-    # A tenth of the ground size of four pixels: what SIFT gives on clean texture.
-    assert np.allclose((link.transform.x_m, link.transform.y_m), expected, atol=0.3)
-    assert link.transform.yaw_rad == pytest.approx(0.05, abs=0.005)
-    assert link.transform.scale == pytest.approx(1.0, abs=0.01)
-
-
-def test_register_rejects_ground_that_does_not_overlap_and_a_wrong_altitude() -> None:
-    config = MapperConfig()
-    first = extract(FLIGHT[0][0], config)
-    assert isinstance(register(first, extract(shoot(9, 80.0, 60.0, 0.0)[0], config), config), Rejection)
-    wrong = replace(FLIGHT[1][0], altitude_m=90.0)
-    assert register(first, extract(wrong, config), config) == Rejection("scale")
-
-
-def test_a_blank_image_has_no_features_and_links_to_nothing() -> None:
-    blank = replace(FLIGHT[0][0], image_bgr=np.zeros_like(FLIGHT[0][0].image_bgr))
-    features = extract(blank, MapperConfig())
-    assert len(features.points_m) == 0
-    assert register(features, features, MapperConfig()) == Rejection("few_matches")
 
 
 def test_pose_graph_spreads_a_loop_closure_and_pulls_scale_to_one() -> None:
@@ -152,6 +74,34 @@ def test_fusion_counts_views_and_drops_what_one_view_alone_claims() -> None:
         fused.confirmed(replace(config, min_observations=1, min_share=0.3)).sum()
         > alone.confirmed(config).sum()
     )
+
+
+def test_fusion_puts_the_mask_of_a_distorting_lens_where_the_ground_is() -> None:
+    (frame, mask), pose, config = FLIGHT[0], Similarity(0.0, 0.0, 0.0, 1.0), MapperConfig()
+    lens = replace(frame.camera, distortion=(-0.25, 0.08, 0.001, -0.002))
+    v, u = np.mgrid[: lens.height, : lens.width].astype(np.float64)
+    k = camera_matrix(lens)
+    ideal = cv2.undistortPoints(
+        np.stack([u, v], axis=-1).reshape(-1, 1, 2), k, np.array(lens.distortion), R=np.eye(3), P=k
+    ).reshape(lens.height, lens.width, 2)
+    bent = (cv2.remap(mask.pixels, ideal.astype(np.float32), None, cv2.INTER_LINEAR) > 127).astype(
+        np.uint8
+    ) * 255
+    views = [View(p, c, frame.altitude_m, LEVEL) for p, c in ((mask.pixels, frame.camera), (bent, lens))]
+    fused = fuse(views, [pose, pose], config)
+    both, any_ = (fused.building == 2).sum(), ((fused.building > 0) & (fused.seen == 2)).sum()
+    assert both / any_ > 0.97  # all but the outlines' own pixels
+    wrong = fuse([views[0], replace(views[1], camera=frame.camera)], [pose, pose], config)
+    assert (wrong.building == 2).sum() / ((wrong.building > 0) & (wrong.seen == 2)).sum() < 0.95
+
+
+def test_a_jump_in_altitude_is_counted_and_left_out() -> None:
+    mapper = Mapper(MapperConfig())
+    mapper.add(*FLIGHT[0])
+    frame, mask = FLIGHT[1]
+    assert mapper.add(replace(frame, altitude_m=95.0), mask) is None
+    update = mapper.add(frame, mask)
+    assert update is not None and update.funnel["rejected_scale"] == 1
 
 
 def test_extraction_leaves_out_buildings_that_were_not_seen_whole() -> None:

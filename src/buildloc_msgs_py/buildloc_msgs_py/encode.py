@@ -67,7 +67,7 @@ def encode_camera_info(camera: CameraModel, stamp_ns: int, frame_id: str) -> Cam
     k = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
     return CameraInfo(
         header=header(stamp_ns, frame_id), width=int(camera.width), height=int(camera.height),
-        distortion_model="plumb_bob", d=array.array("d", [float(v) for v in camera.distortion]),
+        distortion_model=camera.distortion_model, d=array.array("d", [float(v) for v in camera.distortion]),
         k=[float(v) for v in k], r=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
         p=[float(v) for v in (*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0)],
     )  # fmt: skip

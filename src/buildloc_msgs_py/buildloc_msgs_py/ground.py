@@ -18,6 +18,7 @@ from buildloc_msgs_py.types import ByteArray, CameraModel, FloatArray, Frame, Fr
 from buildloc_msgs_py.wire import WireError
 
 Quaternion = tuple[float, float, float, float]
+UNDISTORT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-10)  # ends well below a pixel
 
 
 def rotation_matrix(attitude_xyzw: Quaternion) -> FloatArray:
@@ -58,24 +59,77 @@ def camera_matrix(camera: CameraModel) -> FloatArray:
     return np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
 
 
+def _rays(uv: FloatArray, camera: CameraModel) -> FloatArray:
+    """(N, 2) pixels of the image as taken -> (N, 3) rays (x, y, 1) in camera axes, distortion removed."""
+    if not any(camera.distortion) or len(uv) == 0:
+        xy = (uv - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    else:
+        undistort = (
+            cv2.fisheye.undistortPoints if camera.distortion_model == "equidistant" else cv2.undistortPoints
+        )
+        points, coefficients = uv.reshape(-1, 1, 2).astype(np.float64), np.array(camera.distortion)
+        undistorted = undistort(
+            points, camera_matrix(camera), coefficients, R=np.eye(3), P=np.eye(3), criteria=UNDISTORT
+        )
+        xy = np.asarray(undistorted, dtype=np.float64).reshape(-1, 2)
+    return np.column_stack([xy, np.ones(len(uv))])
+
+
 def pixels_to_level(
     uv: FloatArray, camera: CameraModel, altitude_m: float, attitude_xyzw: Quaternion
 ) -> FloatArray:
-    """(N, 2) pixels -> (N, 2) metres in the level camera frame."""
-    rays = np.column_stack([(uv - [camera.cx, camera.cy]) / [camera.fx, camera.fy], np.ones(len(uv))])
-    level = rays @ level_matrix(attitude_xyzw).T
+    """(N, 2) pixels of the image as taken -> (N, 2) metres in the level camera frame."""
+    level = _rays(uv, camera) @ level_matrix(attitude_xyzw).T
     ground = level[:, :2] / level[:, 2:] * altitude_m
     return np.asarray(ground * [1.0, -1.0], dtype=np.float64)
+
+
+def resample(
+    image: ByteArray,
+    camera: CameraModel,
+    pixel_to_ray: FloatArray,
+    size: tuple[int, int],
+    interpolation: int = cv2.INTER_LINEAR,
+) -> ByteArray:
+    """What the camera saw along the rays of another image, ``size`` (width, height); zero outside.
+
+    ``pixel_to_ray`` (3, 3) takes an output pixel (u, v, 1) to a ray in camera axes, of any length.
+    """
+    k = camera_matrix(camera)
+    if not any(camera.distortion):
+        flags = interpolation | cv2.WARP_INVERSE_MAP
+        return np.asarray(cv2.warpPerspective(image, k @ pixel_to_ray, size, flags=flags), dtype=np.uint8)
+    maps = (
+        cv2.fisheye.initUndistortRectifyMap
+        if camera.distortion_model == "equidistant"
+        else cv2.initUndistortRectifyMap
+    )
+    # OpenCV asks for the matrix that takes rays to output pixels, and inverts it.
+    to_pixel, coefficients = np.linalg.inv(pixel_to_ray), np.array(camera.distortion)
+    u, v = maps(k, coefficients, np.eye(3), to_pixel, size, cv2.CV_32FC1)
+    return np.asarray(cv2.remap(image, u, v, interpolation), dtype=np.uint8)
+
+
+def level_to_ray(altitude_m: float, attitude_xyzw: Quaternion) -> FloatArray:
+    """(3, 3) from (x, y, 1), metres in the level camera frame, to a ray in camera axes."""
+    return np.asarray(level_matrix(attitude_xyzw).T @ np.diag([1.0, -1.0, altitude_m]), dtype=np.float64)
 
 
 def rectify(
     image: ByteArray, camera: CameraModel, attitude_xyzw: Quaternion, interpolation: int = cv2.INTER_LINEAR
 ) -> ByteArray:
-    """The image as a camera of the same intrinsics would have taken it looking straight down."""
-    k = camera_matrix(camera)
-    homography = k @ level_matrix(attitude_xyzw) @ np.linalg.inv(k)
-    warped = cv2.warpPerspective(image, homography, (camera.width, camera.height), flags=interpolation)
-    return np.asarray(warped, dtype=np.uint8)
+    """The image as a pinhole camera of the same intrinsics would have taken it looking straight down."""
+    pixel_to_ray = level_matrix(attitude_xyzw).T @ np.linalg.inv(camera_matrix(camera))
+    return resample(image, camera, pixel_to_ray, (camera.width, camera.height), interpolation)
+
+
+def border(camera: CameraModel) -> FloatArray:
+    """(N, 2) pixels along the image's outer edge, closely enough that a distorted edge keeps its bend."""
+    steps = np.linspace(0.0, 1.0, 17 if any(camera.distortion) else 2)[:-1]
+    w, h = float(camera.width), float(camera.height)
+    none, all_ = np.zeros_like(steps), np.ones_like(steps)
+    sides = [(steps, none), (all_, steps), (1.0 - steps, all_), (none, 1.0 - steps)]
+    return np.vstack([np.column_stack([u * w, v * h]) for u, v in sides]) - 0.5
 
 
 def validate_frame(frame: Frame) -> None:

@@ -10,10 +10,14 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 ByteArray = NDArray[np.uint8]
 
+# Lens models of CameraInfo, each with the numbers of coefficients that it may have.
+DISTORTION_MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
+
 
 @dataclass(frozen=True)
 class CameraModel:
-    """Pinhole intrinsics in pixels; distortion is plumb-bob (empty when the images are rectified)."""
+    """Intrinsics in pixels. ``distortion`` is empty when the images are rectified; its coefficients are
+    those of ``distortion_model``, a key of :data:`DISTORTION_MODELS`, in the order of CameraInfo's d."""
 
     width: int
     height: int
@@ -22,6 +26,7 @@ class CameraModel:
     cx: float
     cy: float
     distortion: tuple[float, ...] = ()
+    distortion_model: str = "plumb_bob"
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from buildloc_msgs_py.errors import BuildlocError
-from buildloc_msgs_py.types import ByteArray, CameraModel, Candidate, Fix, Keyframe, LocalMap, Mask, NoFix
+from buildloc_msgs_py.types import (
+    DISTORTION_MODELS,
+    ByteArray,
+    CameraModel,
+    Candidate,
+    Fix,
+    Keyframe,
+    LocalMap,
+    Mask,
+    NoFix,
+)
 
 MAP_FIELDS = (
     "id", "x", "y", "area", "compactness", "elongation", "rectangularity", "convexity", "observations",
@@ -63,16 +73,25 @@ def decode_compressed_image(msg: Any) -> ByteArray:
 
 
 def decode_camera_info(msg: Any) -> CameraModel:
-    """Intrinsics of a sensor_msgs/CameraInfo; WireError when it is uncalibrated."""
+    """Intrinsics of a sensor_msgs/CameraInfo; WireError when it is uncalibrated or its lens unknown."""
     k = np.asarray(msg.k if hasattr(msg, "k") else msg.K, dtype=np.float64)
     distortion = np.asarray(msg.d if hasattr(msg, "d") else msg.D, dtype=np.float64)
     if not (np.isfinite(k).all() and k[0] > 0 and k[4] > 0 and msg.width > 0 and msg.height > 0):
         raise WireError(
             "camera_info is not calibrated (fx, fy or size is zero); publish the camera's calibration"
         )
+    model = str(msg.distortion_model) if len(distortion) else "plumb_bob"
+    if len(distortion) and len(distortion) not in DISTORTION_MODELS.get(model, ()):
+        known = "; ".join(f"{n} {' or '.join(map(str, c))}" for n, c in DISTORTION_MODELS.items())
+        raise WireError(
+            f"camera_info has distortion model {model!r} with {len(distortion)} coefficients; "
+            f"publish one of: {known}, or rectified images without coefficients"
+        )
+    if not np.isfinite(distortion).all():
+        raise WireError("camera_info has a distortion that is not finite; publish the camera's calibration")
     return CameraModel(
         int(msg.width), int(msg.height), float(k[0]), float(k[4]), float(k[2]), float(k[5]),
-        tuple(float(v) for v in distortion),
+        tuple(float(v) for v in distortion), model,
     )  # fmt: skip
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from buildloc_msgs_py import ground, topics
@@ -75,6 +76,40 @@ def test_tilt_moves_the_centre_by_its_tangent_and_heading_does_not() -> None:
     turned = (w * tilted[0], z * tilted[0], z * tilted[3], w * tilted[3])  # heading after tilt
     assert ground.pixels_to_level(centre, CAMERA, 100.0, turned) == pytest.approx(there)
     assert ground.heading_rad((0.0, 0.0, z, w)) == pytest.approx(math.radians(70.0))
+
+
+LENSES = [
+    ((-0.2, 0.05, 0.001, -0.002, 0.0), "plumb_bob"),
+    ((-0.2, 0.05, 0.001, -0.002, 0.01, 0.1, 0.02, 0.001), "rational_polynomial"),
+    ((0.05, -0.02, 0.003, -0.001), "equidistant"),
+]
+
+
+@pytest.mark.parametrize(("distortion", "model"), LENSES)
+def test_distortion_is_taken_out_of_points_and_of_images_alike(
+    distortion: tuple[float, ...], model: str
+) -> None:
+    camera = CameraModel(640, 480, 500.0, 510.0, 322.0, 236.0, distortion, model)
+    tilted = (0.08, -0.05, 0.0, math.sqrt(1 - 0.08**2 - 0.05**2))
+    uv = np.array([[240.0, 150.0], [322.0, 236.0], [480.0, 340.0]])
+    level = ground.pixels_to_level(uv, camera, 100.0, tilted)
+    back = level @ [[1.0, 0.0], [0.0, -1.0]] / 100.0 * [500.0, 510.0] + [322.0, 236.0]
+    image = np.zeros((480, 640), dtype=np.uint8)
+    for u, v in uv.astype(int):
+        cv2.circle(image, (u, v), 5, 255, -1)
+    discs = (ground.rectify(image, camera, tilted) > 127).astype(np.uint8)
+    _, _, _, found = cv2.connectedComponentsWithStats(discs)
+    # A disc's centre moves less than half a pixel where its lens and tilt bend it.
+    assert np.sort(found[1:], axis=0) == pytest.approx(np.sort(back, axis=0), abs=0.5)
+    straight = ground.pixels_to_level(uv, replace(camera, distortion=()), 100.0, tilted)
+    assert np.abs(straight - level)[[0, 2]].max() > 0.3
+
+
+def test_a_bent_edge_is_followed() -> None:
+    straight, bent = replace(CAMERA, distortion=()), replace(CAMERA, distortion=(-0.2, 0.0, 0.0, 0.0))
+    assert len(ground.border(straight)) == 4
+    assert ground.border(straight).tolist() == [[-0.5, -0.5], [63.5, -0.5], [63.5, 47.5], [-0.5, 47.5]]
+    assert len(ground.border(bent)) == 64
 
 
 def test_a_camera_that_looks_at_the_horizon_is_refused() -> None:

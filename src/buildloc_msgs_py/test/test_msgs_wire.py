@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import cv2
@@ -76,6 +76,17 @@ def test_compressed_image(travel: Travel) -> None:
 def test_camera_info(travel: Travel) -> None:
     camera = CameraModel(1280, 720, 900.5, 901.5, 640.25, 359.75, (0.1, -0.2, 0.001, 0.002, 0.05))
     same(wire.decode_camera_info(travel(encode.encode_camera_info(camera, STAMP, "camera"))), camera)
+    rational = replace(camera, distortion=(0.1,) * 8, distortion_model="rational_polynomial")
+    fisheye = replace(camera, distortion=(0.1,) * 4, distortion_model="equidistant")
+    rectified = replace(camera, distortion=())
+    for lens in (rational, fisheye, rectified):
+        same(wire.decode_camera_info(travel(encode.encode_camera_info(lens, STAMP, "camera"))), lens)
+    for odd in (replace(fisheye, distortion_model="omni"), replace(fisheye, distortion=(0.1,) * 5)):
+        with pytest.raises(wire.WireError, match=r"model '\w+' with \d coefficients; publish"):
+            wire.decode_camera_info(travel(encode.encode_camera_info(odd, STAMP, "camera")))
+    endless = replace(fisheye, distortion=(math.nan,) * 4)
+    with pytest.raises(wire.WireError, match="not finite"):
+        wire.decode_camera_info(travel(encode.encode_camera_info(endless, STAMP, "camera")))
     bare = CameraModel(1280, 720, 0.0, 0.0, 0.0, 0.0)
     with pytest.raises(wire.WireError, match="not calibrated"):
         wire.decode_camera_info(travel(encode.encode_camera_info(bare, STAMP, "camera")))
