@@ -19,7 +19,7 @@ from std_srvs.srv import Trigger
 from buildloc_mapper.config import MapperConfig
 from buildloc_mapper.mapper import Mapper
 
-FRAMES_KEPT = 20
+FRAMES_KEPT = 100  # that wait for a mask; a busy segmenter may lag by seconds
 
 
 class MapperNode(Node):  # type: ignore[misc]
@@ -54,8 +54,11 @@ class MapperNode(Node):  # type: ignore[misc]
 
     def _add(self, stamp_ns: int) -> None:
         """Add a keyframe once its image and its mask are both here."""
+        newest_mask = max(self._masks, default=0)
         if stamp_ns in self._frames and stamp_ns in self._masks:
             self._update(self._frames.pop(stamp_ns), self._masks.pop(stamp_ns))
+        for passed in [frame for frame in self._frames if frame < newest_mask]:  # masks come in order
+            del self._frames[passed]
         while len(self._frames) > FRAMES_KEPT:
             self._frames.pop(next(iter(self._frames)))
         newest = next(reversed(self._frames), 0)
