@@ -77,13 +77,13 @@ class MatcherConfig:
     min_buildings: int = param(12, "fewest buildings in the map for a fix", 3, 100000)
     min_jaccard: float = param(0.2, "smallest MNN-Jaccard of an accepted candidate", 0.0, 1.0)
     min_log_odds: float = param(
-        25.0,
+        30.0,
         "smallest evidence of an accepted candidate beyond what chance gives in the reference, nats",
         -300.0,
         1e4,
     )
     min_lead: float = param(
-        20.0, "smallest lead in evidence over the best candidate elsewhere, nats", 0.0, 1e4
+        30.0, "smallest lead in evidence over the best candidate elsewhere, nats", 0.0, 1e4
     )
     rival_distance_m: float = param(15.0, "candidates further away than this are elsewhere, m", 0.0, 1e6)
     min_pairs: int = param(10, "fewest distinct reference buildings matched for a fix", 3, 100000)

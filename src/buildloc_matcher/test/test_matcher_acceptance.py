@@ -45,11 +45,11 @@ GOOD = Score(Similarity((0, 0), (0, 0), 0.0), np.zeros((20, 2)), np.zeros((20, 2
 @pytest.mark.parametrize(
     ("score", "lead_nats", "odds", "text"),
     [
-        (GOOD, 21.0, 24.9, "could be chance: log-odds 24.9, below 25"),
-        (replace(GOOD, jaccard=0.15), 21.0, 26.0, "MNN-Jaccard 0.15, below 0.2"),
-        (GOOD, 19.9, 26.0, "leads another place by 19.9 nats, below 20"),
-        (replace(GOOD, pairs=np.zeros((9, 2), np.int64)), 21.0, 26.0, "matches 9 buildings, fewer than 10"),
-        (replace(GOOD, rms_m=10.1), 21.0, 26.0, "residuals of 10.1 m, above 10 m"),
+        (GOOD, 31.0, 29.9, "could be chance: log-odds 29.9, below 30"),
+        (replace(GOOD, jaccard=0.15), 31.0, 31.0, "MNN-Jaccard 0.15, below 0.2"),
+        (GOOD, 29.9, 31.0, "leads another place by 29.9 nats, below 30"),
+        (replace(GOOD, pairs=np.zeros((9, 2), np.int64)), 31.0, 31.0, "matches 9 buildings, fewer than 10"),
+        (replace(GOOD, rms_m=10.1), 31.0, 31.0, "residuals of 10.1 m, above 10 m"),
     ],
 )
 def test_each_figure_that_falls_short_is_named(
@@ -57,7 +57,7 @@ def test_each_figure_that_falls_short_is_named(
 ) -> None:
     reason = refuse_coarse(score, lead_nats, odds, CONFIG)
     assert reason is not None and text in reason
-    assert refuse_coarse(GOOD, 20.0, 25.0, CONFIG) is None
+    assert refuse_coarse(GOOD, 30.0, 30.0, CONFIG) is None
 
 
 def test_each_figure_of_the_refinement_that_falls_short_is_named() -> None:
