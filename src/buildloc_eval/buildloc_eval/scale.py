@@ -31,6 +31,7 @@ from buildloc_matcher.reference.build import build
 from buildloc_matcher.reference.database import ReferenceDatabase, open_database
 from buildloc_matcher.reference.region import Circle
 from buildloc_msgs_py.types import LocalMap
+from matplotlib.ticker import NullFormatter
 from scipy.spatial import cKDTree
 from scipy.stats import binomtest
 
@@ -46,6 +47,7 @@ Progress = Callable[[str], None]
 SOURCE = "footprints/boston_osm.parquet"
 CORRECT_M = 100.0
 OUTSIDE_M = 1000.0
+TICKS = (20_000, 50_000, 100_000, 200_000, 500_000)
 REAL = "reference: real footprints (OpenStreetMap, greater Boston); maps: simulated; no images"
 
 
@@ -366,6 +368,8 @@ def draw_plots(
             axes.set(
                 title=f"maps of {count} buildings", xlabel="reference buildings", xscale="log", yscale=scale
             )
+            axes.set_xticks(TICKS, [f"{tick // 1000}k" for tick in TICKS])
+            axes.xaxis.set_minor_formatter(NullFormatter())
             axes.grid(alpha=0.3)
         panels[0].set_ylabel(label)
         panels[1].legend(fontsize=8)
