@@ -83,8 +83,8 @@ class ObservedMap:
         return np.array([moved.real, moved.imag])
 
 
-def fly_path(start_m: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Places (P, 2) every STEP_M and the heading (P,) there: straight legs with turns of 30 to 120 deg."""
+def fly_path(start_m: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Places (P, 2) every STEP_M: straight legs with turns of 30 to 120 deg."""
     steps = int(LONGEST_PATH_M / STEP_M)
     headings = np.empty(steps)
     heading, at = rng.uniform(-math.pi, math.pi), 0
@@ -94,7 +94,7 @@ def fly_path(start_m: FloatArray, rng: np.random.Generator) -> tuple[FloatArray,
         heading += math.copysign(rng.uniform(math.radians(30.0), math.radians(120.0)), rng.uniform(-1.0, 1.0))
         at += leg
     along = np.cumsum(np.column_stack([np.cos(headings), np.sin(headings)]) * STEP_M, axis=0)
-    return start_m + along, headings
+    return np.asarray(start_m + along)
 
 
 def _bend(path_m: FloatArray, model: Sensing, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
@@ -121,8 +121,7 @@ def observe_map(
     """
     for _ in range(STARTS_TRIED):
         start = reference.centroids_m[rng.integers(len(reference))]
-        path, headings = fly_path(start, rng)
-        del headings
+        path = fly_path(start, rng)
         found = _observe_along(reference, tree, path, count, model, rng, digitiser)
         if found is not None:
             return found
