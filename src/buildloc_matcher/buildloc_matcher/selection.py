@@ -143,16 +143,13 @@ def shifted(places_m: FloatArray, reference: Ground, config: MatcherConfig) -> F
     round. Votes do not show that, since the voting bins are larger than a house.
     """
     grid = reference.grid
+    where = (grid.points_m, grid.starts, grid.frame)
     around = reference.buildings_m[near(grid, places_m[:1], SHIFT_M)]
     found = []
     for turn in (1.0, -1.0):
         turned = places_m.mean(axis=0) + turn * (places_m - places_m.mean(axis=0))
-        for target in around:
-            moved = turned + (target - turned[0])
-            hits = [
-                nearest(grid.points_m, grid.starts, grid.frame, x, y, config.mnn_distance_m)[0]
-                for x, y in moved
-            ]
+        for moved in (turned + (around - turned[0])[:, None]).tolist():
+            hits = [nearest(*where, x, y, config.mnn_distance_m)[0] for x, y in moved]
             if min(hits) >= 0 and len(set(hits)) == len(hits):
                 found.append(grid.points_m[hits])
     return np.array(found).reshape(-1, 3, 2)
