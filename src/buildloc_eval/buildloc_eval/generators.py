@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import faiss
 import numpy as np
 from buildloc_matcher.match_cache import MakeStarMatcher
-from buildloc_matcher.matching import Matches, QueryStars, StarTable
+from buildloc_matcher.matching import Matches, QueryStars, query_stars
+from buildloc_matcher.reference.database import ReferenceDatabase
 from numpy.typing import NDArray
 
 Encode = Callable[[NDArray[np.float32]], NDArray[np.float32]]
@@ -37,9 +38,9 @@ def shapeless_vector(stars: NDArray[np.float32]) -> NDArray[np.float32]:
 class VectorIndex:
     """Reference stars in a standardised vector space (inverted lists, Faiss)."""
 
-    def __init__(self, encode: Encode, tables: Sequence[StarTable]) -> None:
+    def __init__(self, encode: Encode, stars: NDArray[np.float32]) -> None:
         self._encode = encode
-        vectors = encode(np.concatenate([_stars(table) for table in tables]))
+        vectors = encode(stars)
         self._mean, self._std = vectors.mean(axis=0), vectors.std(axis=0)
         vectors = self._standard(vectors)
         self._quantizer = faiss.IndexFlatL2(vectors.shape[1])
@@ -74,13 +75,14 @@ class NearestStars:
         return Matches(rows, score, rows.size, rows.size)
 
 
-def nearest_stars(encode: Encode, tables: Sequence[StarTable]) -> MakeStarMatcher:
-    """A candidate generator over one index of these tables."""
-    index = VectorIndex(encode, tables)
+def nearest_stars(encode: Encode, database: ReferenceDatabase) -> MakeStarMatcher:
+    """A candidate generator over one index of the stars of a database."""
+    index = VectorIndex(encode, reference_stars(database).features)
     return lambda _, config: NearestStars(index, config.matches_per_star)
 
 
-def _stars(table: StarTable) -> NDArray[np.float32]:
-    """(S, 4, 8) features of a table's stars."""
-    rows = np.concatenate([np.arange(len(table))[:, None], table.neighbours[: len(table)]], axis=1)
-    return np.asarray(table.features[rows], dtype=np.float32)
+def reference_stars(database: ReferenceDatabase) -> QueryStars:
+    """All stars of a database, in the order of their numbers."""
+    parts = [query_stars(tile.triangles, tile.buildings.areas_m2) for tile in database.tiles]
+    features, areas = [part.features for part in parts], [part.areas_m2 for part in parts]
+    return QueryStars(np.concatenate(features), np.concatenate(areas))

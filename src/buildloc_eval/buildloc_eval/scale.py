@@ -25,7 +25,6 @@ from buildloc_matcher import oracle
 from buildloc_matcher.config import matcher_config
 from buildloc_matcher.match_cache import MatchCache
 from buildloc_matcher.matcher import Matcher, MatchResult
-from buildloc_matcher.matching import QueryStars
 from buildloc_matcher.mesh import mesh
 from buildloc_matcher.reference.build import build
 from buildloc_matcher.reference.database import ReferenceDatabase, open_database
@@ -35,7 +34,7 @@ from matplotlib.ticker import NullFormatter
 from scipy.spatial import cKDTree
 from scipy.stats import binomtest
 
-from buildloc_eval.generators import full_vector, nearest_stars, shapeless_vector
+from buildloc_eval.generators import full_vector, nearest_stars, reference_stars, shapeless_vector
 from buildloc_eval.html import write_report
 from buildloc_eval.machine import machine
 from buildloc_eval.memory import peak_memory_mb
@@ -99,9 +98,9 @@ def method(name: str, database: ReferenceDatabase) -> Matcher:
     """A matcher by the name of its preset or of its candidate generator."""
     paper, default = matcher_config({"preset": "paper"}), matcher_config()
     if name == "index 32-D":
-        return Matcher(database, default, nearest_stars(full_vector, database.tables))
+        return Matcher(database, default, nearest_stars(full_vector, database))
     if name == "shape-free 8-D":
-        return Matcher(database, paper, nearest_stars(shapeless_vector, database.tables))
+        return Matcher(database, paper, nearest_stars(shapeless_vector, database))
     return Matcher(database, paper if name == "paper" else default)
 
 
@@ -165,12 +164,7 @@ def built(size: Size, source: Path, path: Path) -> dict[str, Any]:
 def against_oracle(database: ReferenceDatabase, maps: Sequence[LocalMap], name: str) -> dict[str, Any]:
     """Star matching alone, compiled and in plain NumPy, on the same stars; whether they agree."""
     config = matcher_config({"preset": name})
-    parts = [
-        (tile.triangles.star_features(), table)
-        for tile, table in zip(database.tiles, database.tables, strict=True)
-    ]
-    corners = [np.sort(t.areas_m2[t.vertices[: len(t)]], axis=1) for _, t in parts]
-    reference = QueryStars(np.concatenate([f for f, _ in parts]), np.concatenate(corners))
+    reference = reference_stars(database)
     fast, plain, equal = [], [], True
     for local_map in maps:
         large = local_map.areas_m2 >= config.min_area_m2

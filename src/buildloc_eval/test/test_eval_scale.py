@@ -78,7 +78,7 @@ def test_a_star_is_its_own_nearest_neighbour_and_its_vectors_are_right_by_hand()
         assert encode(features[:3]).shape == (3, width)
         rows = np.arange(0, 400, 37)
         stars = QueryStars(features[rows], np.zeros((len(rows), 3), dtype=np.float32))
-        found = nearest_stars(encode, database.tables)(database.tables, matcher_config()).match(stars)
+        found = nearest_stars(encode, database)(database.tables, matcher_config()).match(stars)
         assert (found.reference[:, 0] == rows).all() and found.score[:, 0] == pytest.approx(1.0, abs=1e-3)
     # The 3-4-5 triangle: area 6, perimeter 12.
     right = np.zeros((1, 4, 8), dtype=np.float32)

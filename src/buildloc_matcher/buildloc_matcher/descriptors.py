@@ -17,7 +17,6 @@ from scipy.spatial import Delaunay, QhullError
 DESCRIPTOR_VERSION = 2
 TRIANGLE_FEATURES = 8
 SMALL_ANGLE, MIDDLE_ANGLE, AREA, PERIMETER, SHAPE = 0, 1, 2, 3, 4  # columns of the features
-STAR_FEATURES = 4 * TRIANGLE_FEATURES
 NO_TRIANGLE = -1
 # A triangle whose circumscribed circle is larger spans empty land that no map shows whole. The limit makes
 # a star depend on its surroundings alone, so that a reference can be built tile by tile.
