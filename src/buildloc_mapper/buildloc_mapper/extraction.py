@@ -238,9 +238,11 @@ class Extractor:
         """
         tiles = {tile for parts in table["parts"] for tile, _ in parts}
         latest = {k for tile in tiles for k in islice(reversed(fusion.keyframes[tile]), VIEWS_COMPARED)}
-        seen = [fusion.drawn[keyframe].sightings for keyframe in sorted(latest)]
-        points = np.concatenate([np.empty((0, 2)), *(s.centroids_m for s in seen)])
-        areas = np.concatenate([np.empty(0), *(s.areas_m2 for s in seen)])
+        seen = [fusion.drawn[keyframe] for keyframe in sorted(latest)]
+        points = np.concatenate(
+            [np.empty((0, 2)), *(d.pose.apply(d.view.sightings.centroids_m) for d in seen)]
+        )
+        areas = np.concatenate([np.empty(0), *(d.pose.scale**2 * d.view.sightings.areas_m2 for d in seen)])
         which, building = shapely.STRtree(table["outline"]).query(shapely.points(points), predicate="within")
         ratio = areas[which] / table["area"][building]
         same = (ratio >= SAME_AREA) & (ratio <= 1.0 / SAME_AREA)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -19,6 +19,23 @@ MAX_SIDE_PX = 16_000  # of a keyframe on the map; OpenCV warps no image of 32768
 
 
 @dataclass(frozen=True)
+class Sightings:
+    """Buildings that one keyframe saw whole: centroids (N, 2) in its level camera frame, areas (N,)."""
+
+    centroids_m: FloatArray
+    areas_m2: FloatArray
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """A keyframe's ground, 0 or 1 per pixel of the box: what it saw, and where it saw a building."""
+
+    box: Box
+    seen: ByteArray
+    building: ByteArray
+
+
+@dataclass(frozen=True)
 class View:
     """The mask of one keyframe, compressed without loss, with what puts it on the ground.
 
@@ -30,6 +47,7 @@ class View:
     altitude_m: float
     attitude_xyzw: tuple[float, float, float, float]
     edge_m: FloatArray
+    sightings: Sightings
 
     @classmethod
     def of(cls, frame: Frame, mask: Mask, config: MapperConfig) -> View:
@@ -42,19 +60,42 @@ class View:
                 f"a keyframe would cover {side:.0f} m of map; check the altitude telemetry or raise map_gsd_m"
             )
         _, png = cv2.imencode(".png", mask.pixels, [cv2.IMWRITE_PNG_BILEVEL, 1])
-        return cls(np.asarray(png, dtype=np.uint8), camera, altitude, attitude, edge)
+        nothing = Sightings(np.empty((0, 2)), np.empty(0))
+        view = cls(np.asarray(png, dtype=np.uint8), camera, altitude, attitude, edge, nothing)
+        level = view.footprint(mask.pixels, Similarity(0.0, 0.0, 0.0, 1.0), config.map_gsd_m)
+        return replace(view, sightings=_sightings(level, config))
 
     def mask(self) -> ByteArray:
         """(H, W) uint8, 0 or 255."""
         return np.asarray(cv2.imdecode(self.png, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
 
+    def footprint(self, mask: ByteArray, pose: Similarity, gsd_m: float) -> Footprint:
+        """The view's own mask on the map: the same to the bit whenever it is asked for at this pose."""
+        edge = pose.apply(self.edge_m) * [1.0, -1.0] / gsd_m
+        (left, top), (right, bottom) = np.floor(edge.min(axis=0)), np.ceil(edge.max(axis=0))
+        box = Box(int(left), int(top), int(right), int(bottom))
+        pixel_to_map = np.array(
+            [[gsd_m, 0.0, (left + 0.5) * gsd_m], [0.0, -gsd_m, -(top + 0.5) * gsd_m], [0, 0, 1.0]]
+        )
+        to_level = np.linalg.inv(pose.matrix()) @ pixel_to_map
+        to_ray = level_to_ray(self.altitude_m, self.attitude_xyzw) @ to_level
+        seen = np.zeros(box.shape, dtype=np.uint8)
+        corners = np.round((edge - (left + 0.5, top + 0.5)) * 16).astype(np.int32)
+        cv2.fillPoly(seen, [corners], 1, cv2.LINE_8, 4)
+        warped = resample(mask, self.camera, to_ray, box.shape[::-1])
+        return Footprint(box, seen, (warped > 127).astype(np.uint8) & seen)
 
-@dataclass(frozen=True)
-class Sightings:
-    """Buildings that one keyframe saw whole: centroids (N, 2) in ``buildloc_map`` and areas (N,)."""
 
-    centroids_m: FloatArray
-    areas_m2: FloatArray
+def _sightings(level: Footprint, config: MapperConfig) -> Sightings:
+    gsd, square = config.map_gsd_m, np.ones((3, 3), np.uint8)
+    _, labels, stats, centroids = cv2.connectedComponentsWithStats(level.building, connectivity=4)
+    inside = cv2.erode(level.seen, square, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    areas = stats[:, cv2.CC_STAT_AREA] * gsd**2
+    whole = areas >= config.min_area_m2
+    whole[0] = False  # the background
+    whole[labels[inside == 0]] = False  # what the image's border may cut
+    pixels = centroids[whole] + (level.box.left + 0.5, level.box.top + 0.5)
+    return Sightings(pixels * np.array([gsd, -gsd]), np.asarray(areas[whole], dtype=np.float64))
 
 
 @dataclass(frozen=True)
@@ -63,45 +104,7 @@ class Drawn:
 
     view: View
     pose: Similarity
-    reach_m: float  # of the keyframe's farthest corner
-    sightings: Sightings
-
-
-@dataclass(frozen=True)
-class _Footprint:
-    """A keyframe's ground, 0 or 1 per pixel of the box: what it saw, and where it saw a building."""
-
-    box: Box
-    seen: ByteArray
-    building: ByteArray
-
-
-def _footprint(view: View, pose: Similarity, gsd_m: float) -> _Footprint:
-    edge = pose.apply(view.edge_m) * [1.0, -1.0] / gsd_m
-    (left, top), (right, bottom) = (v.astype(int) for v in (np.floor(edge.min(0)), np.ceil(edge.max(0))))
-    box = Box(int(left), int(top), int(right), int(bottom))
-    pixel_to_map = np.array(
-        [[gsd_m, 0.0, (left + 0.5) * gsd_m], [0.0, -gsd_m, -(top + 0.5) * gsd_m], [0, 0, 1.0]]
-    )
-    to_ray = level_to_ray(view.altitude_m, view.attitude_xyzw) @ np.linalg.inv(pose.matrix()) @ pixel_to_map
-    seen = np.zeros(box.shape, dtype=np.uint8)
-    corners = np.round((edge - (left + 0.5, top + 0.5)) * 16).astype(np.int32)
-    cv2.fillPoly(seen, [corners], 1, cv2.LINE_8, 4)
-    warped = resample(view.mask(), view.camera, to_ray, box.shape[::-1])
-    return _Footprint(box, seen, (warped > 127).astype(np.uint8) & seen)
-
-
-def _sightings(footprint: _Footprint, config: MapperConfig) -> Sightings:
-    gsd = config.map_gsd_m
-    _, labels, stats, centroids = cv2.connectedComponentsWithStats(footprint.building, connectivity=4)
-    inside = cv2.erode(
-        footprint.seen, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0
-    )
-    areas = stats[:, cv2.CC_STAT_AREA] * gsd**2
-    whole = areas >= config.min_area_m2
-    whole[labels[inside == 0]] = False  # what the keyframe's own border may cut, and the background
-    pixels = centroids[whole] + (footprint.box.left + 0.5, footprint.box.top + 0.5)
-    return Sightings(np.asarray(pixels * [gsd, -gsd], dtype=np.float64), np.asarray(areas[whole], dtype=np.float64))
+    reach_m: float  # of its farthest corner
 
 
 class Fusion:
@@ -138,14 +141,16 @@ class Fusion:
             dirty.update(self.counts)
             self.reset()
         for gone in self.drawn.keys() - poses.keys():
-            dirty.update(self._erase(gone))
+            drawn = self.drawn.pop(gone)
+            dirty.update(self._erase(gone, drawn, drawn.view.mask()))
         due = [*sorted(poses.keys() - self.drawn.keys(), reverse=True), *self._moved(poses)]
         now = due if everything else due[: self._config.max_redraws]
         self.waiting = len(due) - len(now)
         for keyframe in now:
+            mask = views[keyframe].mask()
             if keyframe in self.drawn:
-                dirty.update(self._erase(keyframe))
-            dirty.update(self._draw(keyframe, views[keyframe], poses[keyframe]))
+                dirty.update(self._erase(keyframe, self.drawn[keyframe], mask))
+            dirty.update(self._draw(keyframe, views[keyframe], mask, poses[keyframe]))
         return dirty
 
     def _moved(self, poses: Mapping[int, Similarity]) -> list[int]:
@@ -162,8 +167,8 @@ class Fusion:
         too_far = shift[order] > self._config.redraw_px * self._config.map_gsd_m
         return [int(keyframe) for keyframe in ids[order][too_far]]
 
-    def _draw(self, keyframe: int, view: View, pose: Similarity) -> list[Tile]:
-        footprint = _footprint(view, pose, self._config.map_gsd_m)
+    def _draw(self, keyframe: int, view: View, mask: ByteArray, pose: Similarity) -> list[Tile]:
+        footprint = view.footprint(mask, pose, self._config.map_gsd_m)
         touched = []
         for tile, in_tile, in_box in footprint.box.pieces():
             if not footprint.seen[in_box].any():
@@ -175,14 +180,12 @@ class Fusion:
             self.counts[tile][1][in_tile] += footprint.building[in_box]
             self.keyframes[tile][keyframe] = None
             touched.append(tile)
-        reach = float(np.linalg.norm(view.edge_m, axis=1).max())
-        self.drawn[keyframe] = Drawn(view, pose, reach, _sightings(footprint, self._config))
+        self.drawn[keyframe] = Drawn(view, pose, float(np.linalg.norm(view.edge_m, axis=1).max()))
         return touched
 
-    def _erase(self, keyframe: int) -> list[Tile]:
-        """Take out exactly what :meth:`_draw` put in: the same mask at the same pose."""
-        drawn = self.drawn.pop(keyframe)
-        footprint = _footprint(drawn.view, drawn.pose, self._config.map_gsd_m)
+    def _erase(self, keyframe: int, drawn: Drawn, mask: ByteArray) -> list[Tile]:
+        """Take out of the counts exactly what :meth:`_draw` put in: the same mask at the same pose."""
+        footprint = drawn.view.footprint(mask, drawn.pose, self._config.map_gsd_m)
         touched = []
         for tile, in_tile, in_box in footprint.box.pieces():
             if keyframe not in self.keyframes.get(tile, {}):
