@@ -10,6 +10,11 @@ from buildloc_segmenter.keyframes import Moment, is_keyframe
 from buildloc_segmenter.network import Network
 
 
+def gsd_m(frame: Frame) -> float:
+    """Metres per pixel of a frame below the camera."""
+    return frame.altitude_m / frame.camera.fx
+
+
 class Segmenter:
     """Selects keyframes and segments them.
 
@@ -20,6 +25,19 @@ class Segmenter:
         self._network = Network(config)
         self._config = config
         self._last: Moment | None = None
+
+    @property
+    def provider(self) -> str:
+        """The ONNX Runtime provider that runs the network."""
+        return self._network.provider
+
+    def warm_up(self) -> None:
+        """Run the network once at its largest size. Raises NetworkError."""
+        self._network.warm_up()
+
+    def doubt(self, frame: Frame) -> str | None:
+        """Why the mask of a frame may be poor: it was taken from too high or too low for the network."""
+        return self._network.doubt(gsd_m(frame))
 
     def select(self, frame: Frame) -> bool:
         """Whether the frame is the next keyframe; later frames are then measured from it.
@@ -35,7 +53,7 @@ class Segmenter:
 
     def segment(self, frame: Frame) -> Mask:
         """The building mask of a frame, in the size of its image. Raises NetworkError."""
-        pixels = self._network.segment(frame.image_bgr, frame.altitude_m / frame.camera.fx)
+        pixels = self._network.segment(frame.image_bgr, gsd_m(frame))
         return Mask(frame.stamp_ns, frame.frame_id, pixels)
 
     def process(self, frame: Frame) -> Mask | None:
