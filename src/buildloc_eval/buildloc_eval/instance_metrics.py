@@ -31,9 +31,9 @@ SIMPLIFY_M = 0.5  # outlines are compared in shape as the mapper draws them
 @dataclass(frozen=True)
 class Buildings:
     """The counted buildings (N,) of one side, true or found: number in the label image, centroid (N, 2) x, y
-    in metres from the image's outer corner, area, whether one of the other side was matched with it at the
-    strict and at the least IoU, and
+    in metres from the image's outer corner, area, and what became of each.
 
+    ``matched_strict``, ``matched``: one of the other side was matched with it at the strict, the least IoU.
     ``merged``: one found building holds at least half of this true one and of another; or is such a one.
     ``split``: at least half of each of several found buildings lies in this true one; or is one of those.
     """
@@ -148,7 +148,7 @@ class _Regions:
         flags = np.zeros((4, len(self.pixels)), dtype=bool)
         for flag, numbers in zip(flags, flagged, strict=True):
             flag[numbers] = True
-        area = self.pixels[number] * gsd_m**2
+        area = np.asarray(self.pixels[number] * gsd_m**2, dtype=np.float64)
         return Buildings(number, self.centroid_px[number] * gsd_m, area, *flags[:, number])
 
 
@@ -208,7 +208,7 @@ def outline_distance(a: ByteArray, b: ByteArray) -> float:
 
     An outline is the pixels of the mask that touch what is not; the masks do not reach the border.
     """
-    edges = [mask & (1 - cv2.erode(mask, np.ones((3, 3), np.uint8))) for mask in (a, b)]
+    edges = [mask - cv2.erode(mask, np.ones((3, 3), np.uint8)) for mask in (a, b)]
     away = [cv2.distanceTransform(1 - edge, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for edge in edges]
     return float((away[1][edges[0] > 0].mean() + away[0][edges[1] > 0].mean()) / 2.0)
 

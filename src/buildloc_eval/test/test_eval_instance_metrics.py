@@ -90,7 +90,9 @@ def test_what_is_nowhere_is_missed_and_what_is_invented_is_false() -> None:
 def test_what_the_edge_of_the_labelled_ground_cuts_does_not_count() -> None:
     labelled = np.ones(SHAPE, dtype=np.bool_)
     labelled[:, 50:] = False
-    true = town((0, 10, 10, 20), (30, 40, 40, 60), HOUSE)  # at the picture's edge, at the ground's edge, whole
+    true = town(
+        (0, 10, 10, 20), (30, 40, 40, 60), HOUSE
+    )  # at the picture's edge, at the ground's edge, whole
     found = town((1, 10, 10, 20), (30, 40, 40, 49), HOUSE, (45, 55, 45, 65), (5, 15, 60, 70))
     result = compare(true, found, labelled, GSD)
     # The fourth is cut, the fifth lies on unlabelled ground; the first two are found on cut buildings.
@@ -116,8 +118,8 @@ def test_a_turned_picture_has_the_same_figures() -> None:
     rng = np.random.default_rng(5)
     boxes = [(r, r + 8, c, c + 9) for r in range(2, 50, 12) for c in range(2, 66, 13)]
     true = town(*boxes)
-    moved = [(r + int(dr), s + int(dr), c + int(dc), e + int(dc))
-             for (r, s, c, e), (dr, dc) in zip(boxes, rng.integers(-2, 3, (len(boxes), 2)), strict=True)]  # fmt: skip
+    shifts = rng.integers(-2, 3, (len(boxes), 2)).tolist()
+    moved = [(r + y, s + y, c + x, e + x) for (r, s, c, e), (y, x) in zip(boxes, shifts, strict=True)]
     found = town(*moved[3:])
     upright = figures(scored(true, found))
     turned = compare(np.rot90(true), np.rot90(found), np.ones(SHAPE[::-1], dtype=np.bool_), GSD)
