@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from rendered import Image, Labels, noise
 
 COARSEST_GSD_M = 0.5

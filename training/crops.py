@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -66,7 +66,7 @@ class CropSampler:
         self._rendered = rendered_scenes(config.rendered_scenes, seed) if config.rendered_share > 0.0 else []
 
     def batch(self, step: int, count: int) -> tuple[Image, Image, Image]:
-        """The batch of a step: RGB (n, 3, h, w) 0-255; building and core (n, 2, h, w); weight (n, 1, h, w)."""
+        """A step's batch: RGB 0-255 (n, 3, h, w), building and core (n, 2, h, w), weight (n, 1, h, w)."""
         rng = np.random.default_rng((self._seed, step))
         rgb, target, weight = zip(*(self._crop(rng) for _ in range(count)), strict=True)
         return np.stack(rgb), np.stack(target), np.stack(weight)[:, None]
@@ -128,8 +128,3 @@ def _cut(scene: Scene, to_scene: NDArray[np.float64]) -> tuple[Image, Labels, ND
     )
     known = cv2.warpPerspective(part.labelled.astype(np.uint8), matrix, size, flags=cv2.INTER_NEAREST | flags)
     return out.astype(np.float32), numbers.astype(np.int32), known > 0
-
-
-def scaled(config: CropConfig, rendered: bool) -> CropConfig:
-    """The same, with or without rendered scenes and decoys."""
-    return config if rendered else replace(config, rendered_share=0.0, decoy_share=0.0)

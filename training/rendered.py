@@ -200,14 +200,14 @@ class Canvas:
 
 def _roof_faces(length: float, width: float, kind: str) -> list[tuple[Points, Points]]:
     """Faces of a roof over a rectangle about the origin, and the downhill direction of each."""
-    l, w = length / 2.0, width / 2.0
-    corners = np.array([[l, w], [-l, w], [-l, -w], [l, -w]])
+    half, w = length / 2.0, width / 2.0
+    corners = np.array([[half, w], [-half, w], [-half, -w], [half, -w]])
     if kind == "flat":
         return [(corners, np.zeros(2))]
     if kind == "shed":
         return [(corners, np.array([0.0, 1.0]))]
-    inset = min(w, l * 0.8) if kind == "hip" else 0.0
-    ridge = np.array([[l - inset, 0.0], [-l + inset, 0.0]])
+    inset = min(w, half * 0.8) if kind == "hip" else 0.0
+    ridge = np.array([[half - inset, 0.0], [inset - half, 0.0]])
     faces = [
         (np.array([corners[0], corners[1], ridge[1], ridge[0]]), np.array([0.0, 1.0])),
         (np.array([corners[2], corners[3], ridge[0], ridge[1]]), np.array([0.0, -1.0])),
@@ -246,9 +246,9 @@ def building(canvas: Canvas, number: int, centre: Points, length: float, width: 
     kind = str(rng.choice(("gable", "hip", "flat", "shed"), p=(0.45, 0.2, 0.25, 0.1)))
     stripes, amplitude = rng.uniform(0.25, 1.2) / canvas.gsd, rng.uniform(0.0, 0.12)
     rows, columns = np.mgrid[: canvas.side, : canvas.side].astype(np.float32)
-    for (at, l, w, a), mask in zip(wings, masks, strict=True):
+    for (at, long, wide, a), mask in zip(wings, masks, strict=True):
         t = np.array([[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]])
-        for face, downhill in _roof_faces(l, w, kind):
+        for face, downhill in _roof_faces(long, wide, kind):
             where = _inside(canvas.labels.shape, at + face @ t.T) & mask
             lit = 1.0 - 0.35 * float((t @ downhill) @ canvas.light.away) * (1.0 - canvas.light.shade)
             along = columns[where] * math.cos(a) + rows[where] * math.sin(a)
@@ -279,12 +279,12 @@ def annexes(canvas: Canvas, centre: Points, length: float, width: float, angle: 
         plot = rectangle(centre, length + canvas.px(6, 20), width + canvas.px(6, 20), angle)
         canvas.paint(plot, GROUNDS[rng.integers(len(GROUNDS))] * rng.uniform(0.8, 1.2), 8.0)
     for _ in range(rng.integers(0, 4)):
-        l, w = canvas.px(2.5, 14.0), canvas.px(2.5, 6.0)
+        long, wide = canvas.px(2.5, 14.0), canvas.px(2.5, 6.0)
         side = float(rng.choice((-1, 1)))
-        at = centre + across * side * (width + w) / 2.0 + along * rng.uniform(-0.5, 0.5) * length
+        at = centre + across * side * (width + wide) / 2.0 + along * rng.uniform(-0.5, 0.5) * length
         if rng.random() < 0.5:
-            at = centre + along * side * (length + l) / 2.0 + across * rng.uniform(-0.5, 0.5) * width
-        canvas.paint(rectangle(at, l, w, angle), canvas.paving(), rng.uniform(2.0, 6.0))
+            at = centre + along * side * (length + long) / 2.0 + across * rng.uniform(-0.5, 0.5) * width
+        canvas.paint(rectangle(at, long, wide, angle), canvas.paving(), rng.uniform(2.0, 6.0))
         if rng.random() < 0.3:
             canvas.car(at, angle + rng.choice((0.0, math.pi / 2.0)))
 

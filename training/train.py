@@ -15,17 +15,14 @@ import time
 from pathlib import Path
 
 import cv2
-import matplotlib
-import numpy as np
 import torch
 from buildloc_eval.places import PLACES, Scene, place
 from crops import CropConfig, CropSampler
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from networks import BuildingNet, SegFormer, network
 from torch import Tensor, nn
 from torch.nn import functional
-
-matplotlib.use("Agg")
-from matplotlib import pyplot  # noqa: E402  (after the backend is chosen)
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 COLUMNS = ("step", "loss", "building", "core", "learning_rate", "seconds")
@@ -117,7 +114,9 @@ def draw_curves(log: Path, picture: Path) -> None:
     with log.open() as lines:
         rows = list(csv.DictReader(lines))
     steps = [int(row["step"]) for row in rows]
-    figure, axes = pyplot.subplots(figsize=(8, 4), layout="constrained")
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
     for name in ("building", "core"):
         axes.plot(steps, [float(row[name]) for row in rows], label=name)
     axes.set_xlabel("step")
@@ -127,7 +126,6 @@ def draw_curves(log: Path, picture: Path) -> None:
     rate.plot(steps, [float(row["learning_rate"]) for row in rows], color="0.7", linestyle=":")
     rate.set_ylabel("learning rate / peak")
     figure.savefig(picture, dpi=100)
-    pyplot.close(figure)
 
 
 def train(
@@ -158,7 +156,8 @@ def train(
                 )
             left = training.seconds / training.step * (training.steps - training.step)
             print(
-                f"step {training.step}/{training.steps} loss {building:.3f} + {core:.3f}, {left / 60:.0f} min left",
+                f"step {training.step}/{training.steps} loss {building:.3f} + {core:.3f}, "
+                f"{left / 60:.0f} min left",
                 flush=True,
             )
         if training.step % (8 * EVERY) == 0 or training.step == training.steps:
@@ -195,7 +194,8 @@ def main() -> None:
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     imagery = Path(os.environ.get("BUILDLOC_DATA", REPOSITORY / "../shared/data")) / "imagery"
     settings: dict[str, object] = {
-        "places": args.places, "network": args.network, "steps": args.steps, "batch": args.batch, "seed": args.seed,
+        "places": args.places, "network": args.network, "steps": args.steps, "batch": args.batch,
+        "seed": args.seed,
     }  # fmt: skip
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / "settings.json").write_text(json.dumps(settings, indent=2) + "\n")

@@ -25,6 +25,7 @@ BoolArray = NDArray[np.bool_]
 EQUATOR_M = 2.0 * math.pi * 6378137.0
 IMAGES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 INRIA_GSD_M = 0.3
+FINER = 5
 SPECK_PX = 10  # mask components smaller than this are rasterisation crumbs, no buildings
 
 
@@ -155,11 +156,14 @@ def drawn(outlines_px: list[shapely.Polygon], shape: tuple[int, int]) -> Labels:
         r1, c1 = min(shape[0], int(north) + 2), min(shape[1], int(east) + 2)
         if r1 <= r0 or c1 <= c0:
             continue
-        inside = np.zeros((r1 - r0, c1 - c0), dtype=np.uint8)
+        # fillPoly also paints the pixels that an outline touches: on a finer grid that is next to nothing.
+        inside = np.zeros(((r1 - r0) * FINER, (c1 - c0) * FINER), dtype=np.uint8)
         rings = [
-            np.array(ring.coords) - (c0 + 0.5, r0 + 0.5) for ring in (outline.exterior, *outline.interiors)
+            (np.array(ring.coords) - (c0, r0)) * FINER - 0.5
+            for ring in (outline.exterior, *outline.interiors)
         ]
         cv2.fillPoly(inside, [np.round(ring * 16.0).astype(np.int32) for ring in rings], 1, cv2.LINE_8, 4)
+        inside = inside[FINER // 2 :: FINER, FINER // 2 :: FINER]
         labels[r0:r1, c0:c1][inside > 0] = number + 1
     return labels
 

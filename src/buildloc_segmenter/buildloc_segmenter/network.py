@@ -20,6 +20,7 @@ from buildloc_msgs_py.types import ByteArray
 from buildloc_segmenter.config import SegmenterConfig
 from buildloc_segmenter.contract import METADATA_KEY, contract_from_json, contract_of
 from buildloc_segmenter.instances import FloatImage, Instances, draw_mask, find_instances, owned
+from buildloc_segmenter.outlines import Building, buildings
 from buildloc_segmenter.tiles import Block, blocks, starts
 
 SHIPPED = "models/buildings_lite0.onnx"
@@ -45,6 +46,14 @@ class Scores:
     building: FloatImage
     core: FloatImage | None
     gsd_m: float
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """Mask (H, W) uint8, 0 or 255, and the buildings of an image."""
+
+    mask: ByteArray
+    buildings: tuple[Building, ...]
 
 
 class Network:
@@ -108,6 +117,16 @@ class Network:
             part = mask[block.rows, block.columns]
             part |= draw_mask(found, part.shape[::-1])
         return mask
+
+    def segment_buildings(self, image_bgr: ByteArray, gsd_m: float) -> Segmentation:
+        """The mask as :meth:`segment` has it, and each building with its outline."""
+        mask, found = np.zeros(image_bgr.shape[:2], dtype=np.uint8), list[Building]()
+        for block, instances in self.blocks(image_bgr, gsd_m):
+            part = mask[block.rows, block.columns]
+            part |= draw_mask(instances, part.shape[::-1])
+            corner = (block.columns.start, block.rows.start)
+            found += [building.moved(*corner) for building in buildings(instances, gsd_m)]
+        return Segmentation(mask, tuple(found))
 
     def blocks(self, image_bgr: ByteArray, gsd_m: float) -> Iterator[tuple[Block, Instances]]:
         """The buildings of an image of any size, each in the block that holds its centroid."""

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from buildloc_msgs_py.types import FloatArray
 from numpy.typing import NDArray
 from scipy import ndimage
-from shapely.affinity import affine_transform
+from shapely.affinity import affine_transform, translate
 from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 
@@ -35,6 +35,10 @@ class Building:
     outline: Polygon
     area_m2: float
     score: float
+
+    def moved(self, x: float, y: float) -> Building:
+        """The same building in an image whose pixel (x, y) is the first of this one."""
+        return replace(self, outline=translate(self.outline, x, y))
 
 
 @dataclass(frozen=True)
