@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from buildloc_mapper import extraction
 from buildloc_mapper.config import MapperConfig
 from buildloc_mapper.extraction import Extraction, Extractor, confirmed
 from buildloc_mapper.fusion import Fusion, View
@@ -299,3 +300,14 @@ def test_what_one_view_alone_claims_is_no_building() -> None:
     counts = read(flight.fusion.counts, Box(-120, 40, -80, 80))
     assert not confirmed(counts, CONFIG).any()
     assert confirmed(counts, replace(CONFIG, min_observations=1, min_share=0.3)).any()
+
+
+def test_ground_that_a_network_takes_for_one_building_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(extraction, "LARGEST_PX", 100)  # 25 m
+    flight = Flight()
+    before = flight.fly([(-10.0, -5.0, 10.0, 5.0)], at(0, 0), at(1, 0)).local_map
+    assert len(before) == 1
+    after = flight.fly([(-30.0, -20.0, 30.0, 20.0)], *[at(0, 0)] * 4).local_map
+    assert len(after) == 0
+    again = flight.fly([(-10.0, -5.0, 10.0, 5.0)], *[at(0, 0)] * 8).local_map
+    assert again.ids.tolist() == [before.ids[0] + 1]
