@@ -76,12 +76,12 @@ class _Component:
 
 
 def confirmed(counts: Counts, config: MapperConfig) -> ByteArray:
-    """0 or 1: building in enough keyframes and in a large enough share of those that saw the pixel.
+    """0 or 1: building in enough keyframes and in more than ``min_share`` of those that saw the pixel.
 
     ``counts`` is (2, rows, columns), seen and building.
     """
     seen, building = counts
-    enough = (building >= config.min_observations) & (building >= config.min_share * seen)
+    enough = (building >= config.min_observations) & (building > config.min_share * seen)
     return np.asarray(enough, dtype=np.uint8)
 
 
