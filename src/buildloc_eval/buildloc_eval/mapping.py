@@ -22,8 +22,9 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
+from buildloc_mapper.atlas import ORIGIN
 from buildloc_mapper.config import MapperConfig
-from buildloc_mapper.mapper import ORIGIN, Mapper
+from buildloc_mapper.mapper import Mapper
 from buildloc_mapper.registration import Link, Registration
 from buildloc_mapper.similarity import Similarity
 from buildloc_msgs_py.types import FloatArray, Frame, Mask
