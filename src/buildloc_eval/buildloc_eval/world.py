@@ -69,23 +69,13 @@ def to_utm(latitude_deg: float, longitude_deg: float) -> tuple[int, float, float
     return epsg, float(east), float(north)
 
 
-class OrthoWorld:
-    """A real orthophoto, north up, placed by a JSON with origin_lat_deg, origin_lon_deg and gsd_m."""
+class PictureWorld:
+    """A north-up picture in memory, (H, W) or (H, W, 3), whose outer top-left corner lies at ``left_m``,
+    ``top_m`` of a UTM zone."""
 
-    def __init__(self, image: Path, georef: Path) -> None:
-        try:
-            placed = json.loads(georef.read_text())
-            latitude, longitude = float(placed["origin_lat_deg"]), float(placed["origin_lon_deg"])
-            self._gsd_m = float(placed["gsd_m"])
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise WorldError(
-                f"{georef}: is no georeference; give a JSON with origin_lat_deg, origin_lon_deg, gsd_m"
-            ) from error
-        picture = cv2.imread(str(image), cv2.IMREAD_COLOR)
-        if picture is None:
-            raise WorldError(f"{image}: is not a readable image; give a JPEG, PNG or TIFF orthophoto")
-        self._image = np.asarray(picture, dtype=np.uint8)
-        self.epsg, self._left_m, self._top_m = to_utm(latitude, longitude)
+    def __init__(self, image: ByteArray, epsg: int, left_m: float, top_m: float, gsd_m: float) -> None:
+        self.epsg = epsg
+        self._image, self._left_m, self._top_m, self._gsd_m = image, left_m, top_m, gsd_m
 
     @property
     def bounds_m(self) -> Box:
@@ -105,6 +95,24 @@ class OrthoWorld:
             raise WorldError("the flight leaves the orthophoto; shorten it or choose another region")
         left, top = self._left_m + c0 * self._gsd_m, self._top_m - r0 * self._gsd_m
         return Window(self._image[r0:r1, c0:c1], left, top, self._gsd_m)
+
+
+class OrthoWorld(PictureWorld):
+    """A real orthophoto, north up, placed by a JSON with origin_lat_deg, origin_lon_deg and gsd_m."""
+
+    def __init__(self, image: Path, georef: Path) -> None:
+        try:
+            placed = json.loads(georef.read_text())
+            latitude, longitude = float(placed["origin_lat_deg"]), float(placed["origin_lon_deg"])
+            gsd_m = float(placed["gsd_m"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise WorldError(
+                f"{georef}: is no georeference; give a JSON with origin_lat_deg, origin_lon_deg, gsd_m"
+            ) from error
+        picture = cv2.imread(str(image), cv2.IMREAD_COLOR)
+        if picture is None:
+            raise WorldError(f"{image}: is not a readable image; give a JPEG, PNG or TIFF orthophoto")
+        super().__init__(np.asarray(picture, dtype=np.uint8), *to_utm(latitude, longitude), gsd_m)
 
 
 def _pixels(low_m: float, high_m: float, gsd_m: float, count: int) -> tuple[int, int]:
