@@ -40,6 +40,7 @@ setup(
         "shapely>=2.0,<3",
         "geopandas>=1.0,<2",
         "PyYAML>=6,<7",
+        "matplotlib>=3.6,<4",
         "rosbags>=0.11,<0.12",
     ],
     extras_require={"ros": ["buildloc_msgs_py[ros]"], "test": ["pytest"]},

@@ -28,12 +28,17 @@ class MapperError(BuildlocError):
 
 @dataclass(frozen=True)
 class MapUpdate:
-    """The optimised keyframes, the buildings of the map with their outlines, and the funnel."""
+    """The optimised keyframes, the buildings of the map with their outlines, and the funnel.
+
+    ``links``: earlier and later keyframe, by their place in ``keyframes``, and what links them:
+    ``consecutive``, ``skip``, ``loop`` or ``join``.
+    """
 
     keyframes: tuple[Keyframe, ...]
     local_map: LocalMap
     outlines: LocalOutlines
     funnel: dict[str, float]
+    links: tuple[tuple[int, int, str], ...]
 
 
 @dataclass(frozen=True)
@@ -96,7 +101,8 @@ class Mapper:
             **{f"rejected_{reason}": count for reason, count in sorted(self._rejected.items())},
             "seconds": time.perf_counter() - started,
         }
-        return MapUpdate(keyframes, found.local_map, found.outlines, funnel)
+        links = tuple((e.earlier, e.later, "loop" if e.loop else "consecutive") for e in self._edges)
+        return MapUpdate(keyframes, found.local_map, found.outlines, funnel, links)
 
     def _link(self, earlier: int, node: _Node, loop: bool = False) -> bool:
         link = self._registration.register(self._nodes[earlier].prepared, node.prepared)
