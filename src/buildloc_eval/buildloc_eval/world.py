@@ -97,6 +97,31 @@ class PictureWorld:
         return Window(self._image[r0:r1, c0:c1], left, top, self._gsd_m)
 
 
+class MirroredWorld(PictureWorld):
+    """A picture laid ``times`` side by side and one above the other, every second one mirrored, so that
+    ground goes on over the seams and no two places look alike."""
+
+    def __init__(self, picture: PictureWorld, times: int) -> None:
+        super().__init__(picture._image, picture.epsg, picture._left_m, picture._top_m, picture._gsd_m)
+        self._times = times
+
+    @property
+    def bounds_m(self) -> Box:
+        """All of them; the picture itself is at the top left."""
+        west, south, east, north = super().bounds_m
+        return west, north - self._times * (north - south), west + self._times * (east - west), north
+
+    def window(self, box_m: Box) -> Window:
+        """The pixels that touch the box."""
+        west, south, east, north = box_m
+        gsd, (height, width) = self._gsd_m, self._image.shape[:2]
+        c0, c1 = _pixels(west - self._left_m, east - self._left_m, gsd, self._times * width)
+        r0, r1 = _pixels(self._top_m - north, self._top_m - south, gsd, self._times * height)
+        rows, columns = _mirrored(np.arange(r0, r1), height), _mirrored(np.arange(c0, c1), width)
+        image = self._image[rows[:, None], columns[None, :]]
+        return Window(image, self._left_m + c0 * gsd, self._top_m - r0 * gsd, gsd)
+
+
 class OrthoWorld(PictureWorld):
     """A real orthophoto, north up, placed by a JSON with origin_lat_deg, origin_lon_deg and gsd_m."""
 
@@ -113,6 +138,12 @@ class OrthoWorld(PictureWorld):
         if picture is None:
             raise WorldError(f"{image}: is not a readable image; give a JPEG, PNG or TIFF orthophoto")
         super().__init__(np.asarray(picture, dtype=np.uint8), *to_utm(latitude, longitude), gsd_m)
+
+
+def _mirrored(index: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """0 to count - 1, back to 0, and so on."""
+    folded = index % (2 * count)
+    return np.minimum(folded, 2 * count - 1 - folded)
 
 
 def _pixels(low_m: float, high_m: float, gsd_m: float, count: int) -> tuple[int, int]:
