@@ -82,7 +82,7 @@ def local_map(buildings: Buildings, stamp_ns: int = 0) -> LocalMap:
     """A map without any error, in the frame of the reference."""
     ids = np.arange(len(buildings), dtype=np.int64)
     areas, shapes = buildings.areas_m2.astype(np.float64), buildings.shapes.astype(np.float64)
-    return LocalMap(stamp_ns, ids, buildings.centroids_m, areas, shapes, np.ones_like(ids))
+    return LocalMap.whole(stamp_ns, ids, buildings.centroids_m, areas, shapes, np.ones_like(ids))
 
 
 def observed(buildings: Buildings, count: int, level: float, seed: int) -> ObservedMap:
@@ -93,10 +93,7 @@ def observed(buildings: Buildings, count: int, level: float, seed: int) -> Obser
 
 def first_rows(whole: LocalMap, count: int) -> LocalMap:
     """The map when only its first buildings had been seen."""
-    return LocalMap(
-        whole.stamp_ns, whole.ids[:count], whole.centroids_m[:count], whole.areas_m2[:count],
-        whole.shapes[:count], whole.observations[:count],
-    )  # fmt: skip
+    return whole.select(np.arange(count))
 
 
 def stars_of(buildings: Buildings | LocalMap) -> QueryStars:

@@ -236,6 +236,7 @@ def _map(args: argparse.Namespace) -> int:
         update = mapper.add(frame, mask) or update
         if update is not None:
             _progress(f"{len(update.keyframes)} keyframes, {len(update.local_map)} buildings")
+    update = mapper.finish()
     if update is None:
         raise BuildlocError(f"{args.bag}: gave no map; no keyframe could be added")
     write_map(update.outlines, update.local_map, args.out)

@@ -66,8 +66,10 @@ class MapPicture:
         axes.imshow(mosaic.image_rgba, extent=mosaic.extent_m, interpolation="antialiased")
         places = np.array([(k.x_m, k.y_m) for k in update.keyframes])
         outlines = [np.asarray(outline.exterior.coords) for outline in update.outlines]
-        label = f"{len(outlines)} buildings"
-        axes.add_collection(PolyCollection(outlines, fc="none", ec="yellow", lw=0.8, label=label))
+        for cut, colour, name in ((False, "yellow", "buildings"), (True, "tab:orange", "cut by the border")):
+            drawn = [o for o, is_cut in zip(outlines, update.local_map.cut, strict=True) if is_cut == cut]
+            label = f"{len(drawn)} {name}"
+            axes.add_collection(PolyCollection(drawn, fc="none", ec=colour, lw=0.8, label=label))
         axes.plot(*places.T, "o-", c="tab:blue", lw=1.2, ms=3, label=f"path, {len(places)} keyframes")
         for kind, colour in LINKS.items():
             ends = [places[[earlier, later]] for earlier, later, of in update.links if of == kind]

@@ -36,7 +36,7 @@ def test_an_answer_without_a_rival_is_json_that_everyone_reads() -> None:
     centre = buildings.centroids_m.mean(axis=0)
     some = buildings.select(np.argsort(np.hypot(*(buildings.centroids_m - centre).T))[:60])
     ids = np.arange(60)
-    local_map = LocalMap(
+    local_map = LocalMap.whole(
         0, ids, some.centroids_m - centre, some.areas_m2.astype(float), some.shapes.astype(float), ids + 1
     )
     answer = locate(Matcher(assemble(found.epsg, buildings, config), config), local_map, (0.0, 0.0), 5)

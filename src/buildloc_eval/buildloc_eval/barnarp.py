@@ -25,7 +25,7 @@ from buildloc_matcher.geometry import Similarity, fit_rigid
 from buildloc_matcher.matcher import Matcher
 from buildloc_matcher.reference.build import build
 from buildloc_matcher.reference.database import ReferenceDatabase, open_database
-from buildloc_msgs_py.types import ByteArray, Fix, Frame
+from buildloc_msgs_py.types import ByteArray, Fix, FloatArray, Frame
 from buildloc_segmenter.config import SegmenterConfig
 from buildloc_segmenter.segmenter import Segmenter
 
@@ -117,12 +117,12 @@ def offline_scores(
     if update is None:
         return {"keyframes": 0}
     placed = _map_to_world(update, truth)
-    map_m = placed.apply(update.local_map.centroids_m)
-    true_m = _true_buildings(labels, update, placed, config.min_area_m2)
+    seen = update.local_map.select(~update.local_map.cut)
+    map_m = placed.apply(seen.centroids_m)
+    true_m = _true_buildings(labels, update, seen.centroids_m, placed, config.min_area_m2)
     to_true = np.linalg.norm(map_m[:, None] - true_m[None], axis=2)
-    matched = Matcher(database, config).locate(update.local_map)
-    large = update.local_map.areas_m2 >= config.min_area_m2
-    centre = placed.apply(update.local_map.centroids_m[large]).mean(axis=0)
+    matched = Matcher(database, config).locate(seen)
+    centre = placed.apply(seen.centroids_m[seen.areas_m2 >= config.min_area_m2]).mean(axis=0)
     ranks = [
         rank
         for rank, c in enumerate(matched.candidates, start=1)
@@ -138,7 +138,7 @@ def offline_scores(
         "mask_precision": float(tp / (tp + fp)),
         "mask_recall": float(tp / (tp + fn)),
         "trajectory_rmse_m": float(np.sqrt((residual**2).sum(axis=1).mean())),
-        "map_buildings": len(update.local_map),
+        "map_buildings": len(seen),
         "true_buildings_in_view": len(true_m),
         "buildings_found": int((to_true.min(axis=0) <= FOUND_M).sum()) if to_true.size else 0,
         "map_buildings_true": int((to_true.min(axis=1) <= FOUND_M).sum()) if to_true.size else 0,
@@ -150,7 +150,7 @@ def offline_scores(
 
 
 def _true_buildings(
-    labels: OrthoWorld, update: MapUpdate, placed: Similarity, min_area_m2: float
+    labels: OrthoWorld, update: MapUpdate, map_m: FloatArray, placed: Similarity, min_area_m2: float
 ) -> np.ndarray[Any, np.dtype[np.float64]]:
     """(N, 2) centroids of labelled buildings within the hull of the map's keyframes and buildings."""
     window = labels.window(labels.bounds_m)
@@ -159,7 +159,7 @@ def _true_buildings(
     large = stats[1:, cv2.CC_STAT_AREA] * window.gsd_m**2 >= min_area_m2
     pixels = centroids[1:][large]
     metres = np.array([window.left_m, window.top_m]) + (pixels + 0.5) * [window.gsd_m, -window.gsd_m]
-    seen = np.vstack([update.local_map.centroids_m, [(k.x_m, k.y_m) for k in update.keyframes]])
+    seen = np.vstack([map_m, [(k.x_m, k.y_m) for k in update.keyframes]])
     hull = cv2.convexHull(placed.apply(seen).astype(np.float32))
     inside = [cv2.pointPolygonTest(hull, (float(x), float(y)), False) >= 0 for x, y in metres]
     return np.asarray(metres[np.array(inside, dtype=bool)], dtype=np.float64)

@@ -72,7 +72,7 @@ def mapped(
     flight: Flight, config: MapperConfig, picture: MapPicture | None = None
 ) -> tuple[Path2d, MapUpdate | None]:
     """The flight through the mapper, and the last map; ``picture`` takes the images."""
-    mapper, update, seconds = Mapper(config), None, list[float]()
+    mapper, seconds = Mapper(config), list[float]()
     index_of = dict[int, int]()
     for index in range(len(flight)):
         frame, mask = flight.frame(index), flight.mask(index)
@@ -80,8 +80,9 @@ def mapped(
         if picture is not None:
             picture.add(frame)
         started = time.perf_counter()
-        update = mapper.add(frame, mask) or update
+        mapper.add(frame, mask)
         seconds.append(time.perf_counter() - started)
+    update = mapper.finish()
     if update is None:
         return Path2d((), (), {}), None
     kept = ("loop_closures", "restarts", "submaps")

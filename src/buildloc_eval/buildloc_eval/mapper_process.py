@@ -26,15 +26,16 @@ class Load:
 
 def map_all(config: MapperConfig, shots: Queue[tuple[Frame, Mask] | None], answer: Queue[Load]) -> None:
     """Map keyframes as they come, until None comes; then answer."""
-    mapper, update = Mapper(config), None
+    mapper = Mapper(config)
     wall, processor, resident = list[float](), list[float](), list[float]()
     while (shot := shots.get()) is not None:
         started, worked = time.perf_counter(), time.process_time()
-        update = mapper.add(*shot) or update
+        mapper.add(*shot)
         wall.append(time.perf_counter() - started)
         processor.append(time.process_time() - worked)
         resident.append(_memory_mb("VmRSS"))
-    answer.put(Load(tuple(wall), tuple(processor), tuple(resident), _memory_mb("VmHWM"), update))
+    peak = _memory_mb("VmHWM")
+    answer.put(Load(tuple(wall), tuple(processor), tuple(resident), peak, mapper.finish()))
 
 
 def _memory_mb(what: str) -> float:

@@ -20,10 +20,11 @@ import numpy as np
 import shapely
 from buildloc.map_picture import MapPicture
 from buildloc_mapper.config import MapperConfig
+from buildloc_mapper.extraction import Extractor
+from buildloc_mapper.fusion import Fusion, View
 from buildloc_mapper.mapper import MapUpdate
-from buildloc_mapper.registration import Link
 from buildloc_mapper.similarity import Similarity
-from buildloc_msgs_py.types import FloatArray
+from buildloc_msgs_py.types import FloatArray, LocalMap
 
 from buildloc_eval import endurance
 from buildloc_eval.cut import CutFlight, cut
@@ -112,13 +113,13 @@ def configs(data: Path) -> dict[str, MapperConfig]:
     return found
 
 
-def building_scores(update: MapUpdate, to_world: Similarity, buildings: FloatArray) -> Scores:
-    """Distances of the map's buildings, placed by the alignment of the trajectory, to the nearest true ones,
-    (N, 2) centroids."""
-    placed = to_world.apply(update.local_map.centroids_m)
+def building_scores(local_map: LocalMap, to_world: Similarity, true_m: FloatArray) -> Scores:
+    """Distances of the buildings that were seen whole, placed by the alignment of the trajectory, to the
+    nearest true centroids (N, 2)."""
+    placed = to_world.apply(local_map.select(~local_map.cut).centroids_m)
     if not len(placed):
         return {"buildings": 0}
-    distances = np.linalg.norm(placed[:, None] - buildings[None], axis=2).min(axis=1)
+    distances = np.linalg.norm(placed[:, None] - true_m[None], axis=2).min(axis=1)
     return {
         "buildings": len(placed),
         "median_m": float(np.median(distances)),
@@ -126,28 +127,35 @@ def building_scores(update: MapUpdate, to_world: Similarity, buildings: FloatArr
     }
 
 
+def plain_map(flight: Flight, path: Path2d, config: MapperConfig) -> LocalMap:
+    """The masks fused at the poses of plain chaining, as if the camera had looked straight down."""
+    fusion = Fusion(config)
+    views = {i: View.of(unrectified(flight.frame(i)), flight.mask(i), config) for i in path.index}
+    dirty = fusion.update(views, dict(zip(path.index, path.poses, strict=True)), everything=True)
+    return Extractor(config).update(fusion, dirty, 0).local_map
+
+
 @dataclass(frozen=True)
 class Flown:
-    """What a flight gave: scores by way of mapping, the mapper's path, its map and the alignment."""
+    """What a flight gave: scores and alignment by way of mapping, the mapper's path and its map."""
 
     scores: Scores
+    aligned: dict[str, Aligned]
     path: Path2d
     update: MapUpdate | None
-    aligned: Aligned | None
 
 
 def _fly(
-    flight: Flight, config: MapperConfig, plain: list[Link | None], folder: Path, with_scale: bool = False
+    flight: Flight, config: MapperConfig, others: dict[str, Path2d], folder: Path, with_scale: bool = False
 ) -> Flown:
-    """A flight through the mapper, the same without loop closures, and chained plainly; two pictures."""
+    """A flight through the mapper, beside paths of other ways to map it; two pictures."""
     picture = MapPicture()
     path, update = mapped(flight, config, picture)
-    without, _ = mapped(flight, replace(config, loop_tests=0))
-    paths = {"mapper": path, "without_loop_closures": without, "plain_chaining": chain(plain)}
+    paths = {"mapper": path, **others}
     aligned = {name: found for name, path in paths.items() if (found := align(flight, path, with_scale))}
     scores: Scores = {name: found.scores for name, found in aligned.items()}
-    if update is None or "mapper" not in aligned:
-        return Flown(scores, path, update, None)
+    if update is None:
+        return Flown(scores, aligned, path, update)
     name, alignment = f"{flight.name}_{config.registration}", "similarity" if with_scale else "rigid"
     draw(folder / f"{name}_path.png", flight, aligned, f"{flight.name}: {alignment} alignment to the truth")
     picture.write(update, folder / f"{name}_map.png", f"{flight.name}: the map as the graph has it")
@@ -155,7 +163,7 @@ def _fly(
         (f"{flight.name}, {config.registration}: paths", f"{name}_path.png"),
         (f"{flight.name}, {config.registration}: mosaic, path, buildings, loop closures", f"{name}_map.png"),
     ]
-    return Flown(scores, path, update, aligned["mapper"])
+    return Flown(scores, aligned, path, update)
 
 
 def rtk_scores(data: Path, config: MapperConfig, folder: Path) -> Scores:
@@ -169,7 +177,8 @@ def rtk_scores(data: Path, config: MapperConfig, folder: Path) -> Scores:
     scores: Scores = {"pairs": {**pairs, **counts}, "plain_pairs": plain_pairs}
     if config.registration not in MAPPED_BY:
         return scores
-    flown = _fly(survey, replace(config, map_gsd_m=COARSE_MAP_GSD_M), plain, folder)
+    flat = replace(config, map_gsd_m=COARSE_MAP_GSD_M)
+    flown = _fly(survey, flat, {"plain_chaining": chain(plain)}, folder)
     put_right = align(survey, constants.correct(flown.path), with_scale=False)
     if put_right is not None:
         flown.scores["fitted_to_truth"] = put_right.scores
@@ -181,7 +190,7 @@ def tilted_scores(data: Path, config: MapperConfig, folder: Path, images: int | 
     survey = sheffield(data, images)
     plain, _ = links(survey, config, unrectified)
     flat = replace(config, map_gsd_m=COARSE_MAP_GSD_M)
-    return _fly(survey, flat, plain, folder, with_scale=True).scores
+    return _fly(survey, flat, {"plain_chaining": chain(plain)}, folder, with_scale=True).scores
 
 
 def cut_flight(ground: LabelledGround, seed: int, altitude_factor: float = 1.0) -> CutFlight:
@@ -194,11 +203,17 @@ def cut_flight(ground: LabelledGround, seed: int, altitude_factor: float = 1.0) 
 def cut_scores(ground: LabelledGround, config: MapperConfig, folder: Path, seed: int) -> Scores:
     """Trajectory and buildings of a flight over an orthophoto."""
     flight = cut_flight(ground, seed)
-    plain, _ = links(flight, config, unrectified)
-    flown = _fly(flight, config, plain, folder)
-    if flown.update is not None and flown.aligned is not None:
-        true = shapely.get_coordinates(shapely.centroid(ground.buildings))
-        flown.scores["mapper"]["buildings"] = building_scores(flown.update, flown.aligned.to_world, true)
+    found, _ = links(flight, config, unrectified)
+    plain, (without, _) = chain(found), mapped(flight, replace(config, loop_tests=0))
+    others = {"without_loop_closures": without, "plain_chaining": plain}
+    flown = _fly(flight, config, others, folder)
+    true = shapely.get_coordinates(shapely.centroid(ground.buildings))
+    maps = {"plain_chaining": plain_map(flight, plain, config)}
+    if flown.update is not None:
+        maps["mapper"] = flown.update.local_map
+    for way, aligned in flown.aligned.items():
+        if way in maps:
+            flown.scores[way]["buildings"] = building_scores(maps[way], aligned.to_world, true)
     return flown.scores
 
 

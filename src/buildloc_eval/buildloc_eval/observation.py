@@ -174,7 +174,7 @@ def _observe_along(
     areas = reference.areas_m2[source] * np.exp(rng.normal(0.0, digitiser.log_area_sigma, count)) * scale**2
     noisy = reference.shapes[source] + rng.normal(0.0, digitiser.shape_sigma, (count, 4))
     ids = np.arange(count, dtype=np.int64)
-    local_map = LocalMap(0, ids, local, areas, np.clip(noisy, 0.05, 1.0), np.ones_like(ids))
+    local_map = LocalMap.whole(0, ids, local, areas, np.clip(noisy, 0.05, 1.0), np.ones_like(ids))
     return ObservedMap(local_map, true, float(along.max()) * STEP_M)
 
 

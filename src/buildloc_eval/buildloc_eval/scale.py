@@ -194,7 +194,7 @@ def incremental(database: ReferenceDatabase, observed: Sequence[ObservedMap]) ->
         matcher = Matcher(database, matcher_config())
         whole = one.local_map
         grown_by = max(1, len(whole) // 40)
-        matcher.locate(_first(whole, len(whole) - grown_by))
+        matcher.locate(whole.select(np.arange(len(whole) - grown_by)))
         found: MatchResult = matcher.locate(whole)
         if found.funnel["looks"] > 1:
             continue  # a second look is no step of an incremental search
@@ -205,14 +205,6 @@ def incremental(database: ReferenceDatabase, observed: Sequence[ObservedMap]) ->
         "stars_changed": float(np.median(shares)), "match_ms": float(np.median(match)),
         "locate_ms": float(np.median(total)), "maps": len(shares),
     }  # fmt: skip
-
-
-def _first(local_map: LocalMap, count: int) -> LocalMap:
-    rows = np.arange(count)
-    return LocalMap(
-        local_map.stamp_ns, local_map.ids[rows], local_map.centroids_m[rows], local_map.areas_m2[rows],
-        local_map.shapes[rows], local_map.observations[rows],
-    )  # fmt: skip
 
 
 def exponent(counts: Sequence[float], values: Sequence[float]) -> float:

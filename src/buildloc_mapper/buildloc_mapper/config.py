@@ -40,5 +40,12 @@ class MapperConfig:
     map_gsd_m: float = param(0.25, "ground sampling distance of the fused map, m", 0.05, 5.0)
     min_observations: int = param(2, "fewest keyframes that must see a building pixel", 1, 100)
     min_share: float = param(0.5, "smallest share of the views of a pixel that call it building", 0.01, 1.0)
+    redraw_px: float = param(
+        0.5, "a keyframe that moved more than this is drawn anew, map pixels", 0.0, 100.0
+    )
+    max_redraws: int = param(4, "keyframes drawn, or drawn anew, per keyframe; the others follow", 1, 100000)
+    sigma_centroid_m: float = param(
+        0.5, "standard deviation of a centroid in one keyframe, before any was compared, m", 0.001, 100.0
+    )
     min_area_m2: float = param(20.0, "smallest building of the map, m2", 0.0, 1e5)
     simplify_m: float = param(0.5, "tolerance that takes the pixel stairs out of an outline, m", 0.0, 10.0)

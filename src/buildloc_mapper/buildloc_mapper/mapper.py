@@ -13,8 +13,8 @@ from buildloc_msgs_py.ground import validate_frame
 from buildloc_msgs_py.types import Frame, Keyframe, LocalMap, Mask
 
 from buildloc_mapper.config import MapperConfig
-from buildloc_mapper.extraction import LocalOutlines, extract_buildings
-from buildloc_mapper.fusion import View, fuse
+from buildloc_mapper.extraction import Extractor, LocalOutlines
+from buildloc_mapper.fusion import Fusion, View
 from buildloc_mapper.pose_graph import Edge, optimize
 from buildloc_mapper.registration import Link, Prepared, Registration
 from buildloc_mapper.similarity import Similarity
@@ -61,10 +61,14 @@ class Mapper:
         """Forget the flight."""
         self._rejected: Counter[str] = Counter()
         self._restarts = 0
+        self._earlier = 0
+        self._nodes: list[_Node] = []
+        self._fusion, self._extractor = Fusion(self.config), Extractor(self.config)
         self._start_anew()
 
     def _start_anew(self) -> None:
-        self._nodes: list[_Node] = []
+        self._earlier += len(self._nodes)
+        self._nodes = []
         self._poses: list[Similarity] = []
         self._edges: list[Edge] = []
         self._lost = 0
@@ -79,14 +83,23 @@ class Mapper:
         if mask.stamp_ns != frame.stamp_ns or mask.pixels.shape != frame.image_bgr.shape[:2]:
             raise MapperError("mask and image differ in stamp or size; feed the segmenter's own masks")
         started = time.perf_counter()
-        view = View(mask.pixels, frame.camera, frame.altitude_m, frame.attitude_xyzw)
+        view = View.of(frame, mask, self.config)
         node = _Node(frame.stamp_ns, self._registration.prepare(frame), view)
         if not self._attach(node):
             return None
         self._close_loops()
         self._poses = optimize(self._poses, self._edges, self.config)
-        fused = fuse([n.view for n in self._nodes], self._poses, self.config)
-        found = extract_buildings(fused, frame.stamp_ns, self.config)
+        return self._update(started)
+
+    def finish(self) -> MapUpdate | None:
+        """The map with every keyframe drawn where it is by now; None before the first."""
+        return self._update(time.perf_counter(), everything=True) if self._nodes else None
+
+    def _update(self, started: float, everything: bool = False) -> MapUpdate:
+        ids = range(self._earlier, self._earlier + len(self._nodes))
+        views = {i: node.view for i, node in zip(ids, self._nodes, strict=True)}
+        dirty = self._fusion.update(views, dict(zip(ids, self._poses, strict=True)), everything)
+        found = self._extractor.update(self._fusion, dirty, self._nodes[-1].stamp_ns)
         keyframes = tuple(
             Keyframe(n.stamp_ns, p.x_m, p.y_m, p.yaw_rad, p.scale)
             for n, p in zip(self._nodes, self._poses, strict=True)
@@ -96,8 +109,8 @@ class Mapper:
             "loop_closures": sum(e.loop for e in self._edges),
             "restarts": self._restarts,
             "buildings": len(found.local_map),
-            "truncated": found.truncated,
-            "unusable": found.unusable,
+            "cut": int(found.local_map.cut.sum()),
+            "redraws_waiting": self._fusion.waiting,
             **{f"rejected_{reason}": count for reason, count in sorted(self._rejected.items())},
             "seconds": time.perf_counter() - started,
         }

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import pytest
 from buildloc_mapper.config import MapperConfig
-from buildloc_mapper.extraction import extract_buildings
-from buildloc_mapper.fusion import FusedMap, View, fuse
+from buildloc_mapper.fusion import Fusion, View
 from buildloc_mapper.mapper import Mapper, MapperError
 from buildloc_mapper.pose_graph import Edge, optimize
 from buildloc_mapper.similarity import Similarity
 from buildloc_msgs_py.config import ConfigError
 from buildloc_msgs_py.ground import camera_matrix
+from buildloc_msgs_py.types import Mask
 from textured import BUILDINGS, LEVEL, shoot, tilt
 
 FLIGHT = [
@@ -57,25 +57,6 @@ def test_pose_graph_follows_most_links_when_one_lies() -> None:
     assert abs(optimize(poses, edges, MapperConfig())[2].x_m - 10.0) < 2.0
 
 
-def test_fusion_counts_views_and_drops_what_one_view_alone_claims() -> None:
-    (frame, mask), pose = FLIGHT[0], Similarity(0.0, 0.0, 0.0, 1.0)
-    ghost = mask.pixels.copy()
-    ghost[10:60, 10:60] = 255
-    views = [
-        View(pixels, frame.camera, frame.altitude_m, frame.attitude_xyzw)
-        for pixels in (mask.pixels, mask.pixels, ghost)
-    ]
-    config = MapperConfig()
-    fused = fuse(views, [pose] * 3, config)
-    assert fused.seen.max() == 3
-    alone = fuse(views[:2], [pose] * 2, config)
-    assert np.array_equal(fused.confirmed(config), alone.confirmed(config))
-    assert (
-        fused.confirmed(replace(config, min_observations=1, min_share=0.3)).sum()
-        > alone.confirmed(config).sum()
-    )
-
-
 def test_fusion_puts_the_mask_of_a_distorting_lens_where_the_ground_is() -> None:
     (frame, mask), pose, config = FLIGHT[0], Similarity(0.0, 0.0, 0.0, 1.0), MapperConfig()
     lens = replace(frame.camera, distortion=(-0.25, 0.08, 0.001, -0.002))
@@ -87,12 +68,20 @@ def test_fusion_puts_the_mask_of_a_distorting_lens_where_the_ground_is() -> None
     bent = (cv2.remap(mask.pixels, ideal.astype(np.float32), None, cv2.INTER_LINEAR) > 127).astype(
         np.uint8
     ) * 255
-    views = [View(p, c, frame.altitude_m, LEVEL) for p, c in ((mask.pixels, frame.camera), (bent, lens))]
-    fused = fuse(views, [pose, pose], config)
-    both, any_ = (fused.building == 2).sum(), ((fused.building > 0) & (fused.seen == 2)).sum()
-    assert both / any_ > 0.97  # all but the outlines' own pixels
-    wrong = fuse([views[0], replace(views[1], camera=frame.camera)], [pose, pose], config)
-    assert (wrong.building == 2).sum() / ((wrong.building > 0) & (wrong.seen == 2)).sum() < 0.95
+    views = {
+        0: View.of(frame, mask, config),
+        1: View.of(replace(frame, camera=lens), Mask(0, "", bent), config),
+    }
+    poses = {0: pose, 1: pose}
+
+    def agreement(seen: dict[int, View]) -> float:
+        fusion = Fusion(config)
+        fusion.update(seen, poses)
+        count, building = np.concatenate([c.reshape(2, -1) for c in fusion.counts.values()], axis=1)
+        return float((building == 2).sum() / ((building > 0) & (count == 2)).sum())
+
+    assert agreement(views) > 0.97  # all but the outlines' own pixels
+    assert agreement({0: views[0], 1: View.of(frame, Mask(0, "", bent), config)}) < 0.95
 
 
 def test_a_jump_in_altitude_is_counted_and_left_out() -> None:
@@ -102,18 +91,6 @@ def test_a_jump_in_altitude_is_counted_and_left_out() -> None:
     assert mapper.add(replace(frame, altitude_m=95.0), mask) is None
     update = mapper.add(frame, mask)
     assert update is not None and update.funnel["rejected_scale"] == 1
-
-
-def test_extraction_leaves_out_buildings_that_were_not_seen_whole() -> None:
-    building = np.zeros((40, 60), dtype=np.uint16)
-    building[10:20, 10:30] = 2
-    building[25:35, 40:60] = 2  # runs out of the observed ground
-    seen = np.full_like(building, 2)
-    found = extract_buildings(FusedMap(100.0, 50.0, 1.0, seen, building), 7, MapperConfig())
-    assert (found.truncated, len(found.local_map), found.local_map.stamp_ns) == (1, 1, 7)
-    assert found.local_map.centroids_m[0] == pytest.approx((120.0, 35.0))
-    assert found.local_map.areas_m2[0] == pytest.approx(200.0)
-    assert found.outlines[0].bounds == pytest.approx((110.0, 30.0, 130.0, 40.0))
 
 
 def test_flight_gives_trajectory_and_buildings_in_one_metric_frame() -> None:

@@ -102,20 +102,21 @@ class Matcher:
         some = buildings.select(np.argsort(apart)[:WARM_UP_BUILDINGS])
         ids = np.arange(len(some), dtype=np.int64)
         areas, shapes = some.areas_m2.astype(np.float64), some.shapes.astype(np.float64)
-        self.locate(LocalMap(0, ids, some.centroids_m, areas, shapes, np.ones_like(ids)))
+        self.locate(LocalMap.whole(0, ids, some.centroids_m, areas, shapes, np.ones_like(ids)))
 
     def locate(self, local_map: LocalMap) -> MatchResult:
         """Ranked candidates of a map; their x, y is where the mean of the map's buildings lies.
 
-        Raises MapError for a map that no flight makes.
+        Buildings that are cut by the border of the seen area have neither their place nor their shape yet,
+        and are left out. Raises MapError for a map that no flight makes.
         """
         check_map(local_map)
         config, clock = self.config, _Clock()
-        large = local_map.areas_m2 >= config.min_area_m2
+        usable = (local_map.areas_m2 >= config.min_area_m2) & ~local_map.cut
         points, areas, shapes = (
-            local_map.centroids_m[large],
-            local_map.areas_m2[large],
-            local_map.shapes[large],
+            local_map.centroids_m[usable],
+            local_map.areas_m2[usable],
+            local_map.shapes[usable],
         )
         if len(points) < FEWEST_BUILDINGS:
             return MatchResult((), (), None, {"buildings": len(points)}, clock.seconds)

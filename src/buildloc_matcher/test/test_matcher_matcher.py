@@ -72,7 +72,7 @@ def test_the_paper_preset_locates_a_map_that_does_not_bend() -> None:
     rows = np.flatnonzero(np.hypot(*(TOWN.centroids_m - middle).T) < 180.0)
     rng = np.random.default_rng(1)
     points = (TOWN.centroids_m[rows] - middle) @ rotation(2.0).T + rng.normal(0.0, 1.0, (len(rows), 2))
-    seen = LocalMap(0, rows, points, city.areas_m2[rows], city.shapes[rows], np.ones_like(rows))
+    seen = LocalMap.whole(0, rows, points, city.areas_m2[rows], city.shapes[rows], np.ones_like(rows))
     matcher = Matcher(HERE_BY_PAPER, PAPER)
     found = matcher.locate(seen)
     assert matcher.refuse(found) is None and len(found.candidates) == PAPER.top_k
@@ -147,7 +147,7 @@ def flight(seed: int) -> tuple[LocalMap, list[Keyframe], list[FrameObservation],
         seen.append(FrameObservation(pose.stamp_ns, level + rng.normal(0.0, 0.8, level.shape), 105.0))
     shapes = np.clip(TOWN.shapes[near] + rng.normal(0.0, 0.03, (len(near), 4)), 0.0, 1.0)
     areas = TOWN.areas_m2[near].astype(np.float64)
-    seen_map = LocalMap(poses[-1].stamp_ns, near, points, areas, shapes, np.full(len(near), 3))
+    seen_map = LocalMap.whole(poses[-1].stamp_ns, near, points, areas, shapes, np.full(len(near), 3))
     return seen_map, poses, seen, path[-1], poses[-1].yaw_rad + yaw
 
 
@@ -228,7 +228,7 @@ def test_duplicates_do_no_harm() -> None:
     seen = observed(TOWN, 80, 1, 2)
     twice = np.repeat(np.arange(80), 2)
     m = seen.local_map
-    doubled = LocalMap(
+    doubled = LocalMap.whole(
         0, np.arange(160), m.centroids_m[twice], m.areas_m2[twice], m.shapes[twice], np.ones(160, int)
     )
     matcher = Matcher(HERE, DEFAULT)

@@ -20,7 +20,7 @@ def mask(stamp_ns: int, width: int = 8) -> Mask:
 
 def empty_map(stamp_ns: int) -> LocalMap:
     none = np.empty(0, dtype=np.int64)
-    return LocalMap(stamp_ns, none, np.empty((0, 2)), np.empty(0), np.empty((0, 4)), none)
+    return LocalMap.whole(stamp_ns, none, np.empty((0, 2)), np.empty(0), np.empty((0, 4)), none)
 
 
 def with_telemetry() -> Session:

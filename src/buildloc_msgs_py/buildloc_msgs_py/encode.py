@@ -10,6 +10,7 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion, QuaternionStamped
 from nav_msgs.msg import Path
+from numpy.typing import NDArray
 from sensor_msgs.msg import (
     CameraInfo,
     CompressedImage,
@@ -23,18 +24,18 @@ from sensor_msgs.msg import (
 from std_msgs.msg import Header
 
 from buildloc_msgs_py import topics
+from buildloc_msgs_py.footprint import SHAPE_METRICS
 from buildloc_msgs_py.types import (
     ByteArray,
     CameraModel,
     Candidate,
     Fix,
-    FloatArray,
     Keyframe,
     LocalMap,
     Mask,
     NoFix,
 )
-from buildloc_msgs_py.wire import CANDIDATE_FIELDS, MAP_FIELDS
+from buildloc_msgs_py.wire import CANDIDATE_ROW, MAP_ROW, POINT_TYPES
 
 
 def header(stamp_ns: int, frame_id: str) -> Header:
@@ -111,36 +112,38 @@ def encode_keyframes(keyframes: Sequence[Keyframe]) -> Path:
     return path
 
 
-def encode_rows(rows: FloatArray, fields: Sequence[str], stamp_ns: int, frame_id: str) -> PointCloud2:
-    """(N, C) rows -> PointCloud2 of C float64 columns."""
-    count, columns = len(rows), len(fields)
+def encode_cloud(rows: NDArray[np.void], stamp_ns: int, frame_id: str) -> PointCloud2:
+    """(N,) rows of a structured array -> PointCloud2, a field per column."""
+    count, step = len(rows), int(rows.dtype.itemsize)
+    datatypes = {np.dtype(name): number for number, name in POINT_TYPES.items()}
     return PointCloud2(
         header=header(stamp_ns, frame_id), height=1, width=int(count),
         fields=[
-            PointField(name=name, offset=8 * i, datatype=PointField.FLOAT64, count=1)
-            for i, name in enumerate(fields)
+            PointField(name=name, offset=int(offset), datatype=datatypes[kind], count=1)
+            for name, (kind, offset, *_) in (rows.dtype.fields or {}).items()
         ],
-        is_bigendian=False, point_step=8 * columns, row_step=8 * columns * count, is_dense=True,
-        data=array.array("B", np.ascontiguousarray(rows, dtype="<f8").tobytes()),
+        is_bigendian=False, point_step=step, row_step=step * count, is_dense=True,
+        data=array.array("B", rows.tobytes()),
     )  # fmt: skip
 
 
 def encode_map(local_map: LocalMap) -> PointCloud2:
     """LocalMap -> PointCloud2, one row per building."""
-    rows = np.column_stack(
-        [
-            local_map.ids, local_map.centroids_m.reshape(-1, 2), local_map.areas_m2,
-            local_map.shapes.reshape(-1, 4), local_map.observations,
-        ]
-    )  # fmt: skip
-    return encode_rows(rows, MAP_FIELDS, local_map.stamp_ns, topics.FRAME_MAP)
+    rows = np.zeros(len(local_map), dtype=MAP_ROW)
+    rows["id"], rows["area"], rows["observations"] = local_map.ids, local_map.areas_m2, local_map.observations
+    rows["x"], rows["y"] = local_map.centroids_m.T
+    for name, values in zip(SHAPE_METRICS, local_map.shapes.T, strict=True):
+        rows[name] = values
+    covariances = local_map.covariances_m2
+    rows["covariance_xx"], rows["covariance_yy"] = covariances[:, 0, 0], covariances[:, 1, 1]
+    rows["covariance_xy"], rows["cut"] = covariances[:, 0, 1], local_map.cut
+    return encode_cloud(rows, local_map.stamp_ns, topics.FRAME_MAP)
 
 
 def encode_candidates(candidates: Sequence[Candidate], stamp_ns: int) -> PointCloud2:
     """Candidates, best first -> PointCloud2 in the world frame."""
     rows = [(c.x_m, c.y_m, c.yaw_rad, c.scale, c.votes, c.mnn_jaccard, c.acceptance) for c in candidates]
-    table = np.array(rows, dtype=np.float64).reshape(-1, len(CANDIDATE_FIELDS))
-    return encode_rows(table, CANDIDATE_FIELDS, stamp_ns, topics.FRAME_WORLD)
+    return encode_cloud(np.array(rows, dtype=CANDIDATE_ROW), stamp_ns, topics.FRAME_WORLD)
 
 
 def encode_fix(fix: Fix | NoFix) -> NavSatFix:

@@ -6,10 +6,12 @@ The level camera frame has its origin below the camera, x to image right, y to i
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 from shapely.geometry import Polygon
 
@@ -155,29 +157,34 @@ def validate_frame(frame: Frame) -> None:
         )
 
 
-@dataclass(frozen=True)
-class _Shift:
-    gsd_m: float
-    centre_uv: tuple[float, float]
-
-
-def _polygon(contour: NDArray[np.int32], shift: _Shift) -> Polygon | None:
-    if len(contour) < 3:
-        return None
-    uv = contour.reshape(-1, 2).astype(np.float64)
-    xy = (uv - shift.centre_uv) * [shift.gsd_m, -shift.gsd_m]
+def traced(
+    contours: Sequence[NDArray[np.int32]], gsd_m: float, origin_uv: tuple[float, float]
+) -> NDArray[np.object_]:
+    """(N,) outlines in metres, y up, of N contours of pixels as OpenCV finds them, the origin at a pixel
+    (u, v); None for a contour that encloses no valid polygon."""
+    enough = np.array([len(contour) >= 3 for contour in contours], dtype=bool)
+    found = np.full(len(contours), None, dtype=object)
+    if not enough.any():
+        return found
+    rings = [contour.reshape(-1, 2) for contour, one in zip(contours, enough, strict=True) if one]
+    xy = (np.concatenate(rings).astype(np.float64) - origin_uv) * [gsd_m, -gsd_m]
+    index = np.repeat(np.arange(len(rings)), [len(ring) for ring in rings])
+    polygons = shapely.polygons(shapely.linearrings(xy, indices=index))
     # Contours run through pixel centres; half a pixel outwards gives the pixels' own outline.
-    polygon = Polygon(xy).buffer(0.5 * shift.gsd_m, join_style="mitre")
-    return polygon if isinstance(polygon, Polygon) and polygon.is_valid else None
+    polygons = shapely.buffer(polygons, 0.5 * gsd_m, join_style="mitre")
+    usable = (shapely.get_type_id(polygons) == shapely.GeometryType.POLYGON) & shapely.is_valid(polygons)
+    found[enough] = np.where(usable, polygons, None)
+    return found
 
 
 def outlines(mask_pixels: ByteArray, gsd_m: float, min_area_m2: float) -> list[Polygon]:
     """Connected components of a mask as polygons in metres, y up, origin at the image centre."""
     height, width = mask_pixels.shape
-    shift = _Shift(gsd_m, ((width - 1) / 2.0, (height - 1) / 2.0))
     contours, _ = cv2.findContours(mask_pixels, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    polygons = (_polygon(np.asarray(c, dtype=np.int32), shift) for c in contours)
-    return [p for p in polygons if p is not None and p.area >= min_area_m2]
+    found = traced(
+        [np.asarray(c, dtype=np.int32) for c in contours], gsd_m, ((width - 1) / 2, (height - 1) / 2)
+    )
+    return [polygon for polygon in found if polygon is not None and polygon.area >= min_area_m2]
 
 
 def observe(

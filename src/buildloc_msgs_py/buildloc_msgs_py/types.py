@@ -74,8 +74,10 @@ class Keyframe:
 class LocalMap:
     """Buildings seen so far in ``buildloc_map`` (metric, y up, arbitrary origin and heading).
 
-    ``centroids_m`` (N, 2); ``areas_m2`` (N,); ``shapes`` (N, 4) in the order of
-    :data:`buildloc_msgs_py.footprint.SHAPE_METRICS`; ``observations`` (N,) times observed.
+    ``ids`` (N,) stay with their buildings over a flight; ``centroids_m`` (N, 2); ``areas_m2`` (N,);
+    ``shapes`` (N, 4) in the order of :data:`buildloc_msgs_py.footprint.SHAPE_METRICS`; ``observations`` (N,)
+    times observed. ``covariances_m2`` (N, 2, 2) are those of the centroids, NaN where they are not known.
+    ``cut`` (N,) is true for buildings that reach the border of the seen area: there may be more of them.
     """
 
     stamp_ns: int
@@ -84,9 +86,32 @@ class LocalMap:
     areas_m2: FloatArray
     shapes: FloatArray
     observations: NDArray[np.int64]
+    covariances_m2: FloatArray
+    cut: NDArray[np.bool_]
+
+    @classmethod
+    def whole(
+        cls,
+        stamp_ns: int,
+        ids: NDArray[np.int64],
+        centroids_m: FloatArray,
+        areas_m2: FloatArray,
+        shapes: FloatArray,
+        observations: NDArray[np.int64],
+    ) -> LocalMap:
+        """Buildings of which none is cut, with unknown covariances."""
+        unknown, cut = np.full((len(ids), 2, 2), np.nan), np.zeros(len(ids), dtype=bool)
+        return cls(stamp_ns, ids, centroids_m, areas_m2, shapes, observations, unknown, cut)
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def select(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> LocalMap:
+        """The buildings at these rows."""
+        return LocalMap(
+            self.stamp_ns, self.ids[rows], self.centroids_m[rows], self.areas_m2[rows], self.shapes[rows],
+            self.observations[rows], self.covariances_m2[rows], self.cut[rows],
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -10,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from buildloc_msgs_py.errors import BuildlocError
+from buildloc_msgs_py.footprint import SHAPE_METRICS
 from buildloc_msgs_py.types import (
     DISTORTION_MODELS,
     ByteArray,
@@ -22,10 +25,22 @@ from buildloc_msgs_py.types import (
     NoFix,
 )
 
-MAP_FIELDS = (
-    "id", "x", "y", "area", "compactness", "elongation", "rectangularity", "convexity", "observations",
+# One row per building. x, y, z are float32, and z (0) is there, because RViz draws no other clouds; a
+# float32 holds 10 km to half a millimetre.
+MAP_ROW = np.dtype(
+    [
+        ("id", "<f8"), ("x", "<f4"), ("y", "<f4"), ("area", "<f8"), ("compactness", "<f8"),
+        ("elongation", "<f8"), ("rectangularity", "<f8"), ("convexity", "<f8"), ("observations", "<f8"),
+        ("covariance_xx", "<f8"), ("covariance_xy", "<f8"), ("covariance_yy", "<f8"), ("cut", "u1"),
+        ("z", "<f4"),
+    ],
+    align=True,
 )  # fmt: skip
+MAP_OPTIONAL = ("covariance_xx", "covariance_xy", "covariance_yy", "cut", "z")  # not in older recordings
 CANDIDATE_FIELDS = ("x", "y", "yaw", "scale", "votes", "mnn_jaccard", "acceptance")
+CANDIDATE_ROW = np.dtype([(name, "<f8") for name in CANDIDATE_FIELDS])
+# Types of PointField's datatype.
+POINT_TYPES = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 8: "<f8"}
 STATUS_NO_FIX = -1
 
 
@@ -137,29 +152,51 @@ def decode_keyframes(msg: Any) -> tuple[Keyframe, ...]:
     )  # fmt: skip
 
 
-def decode_rows(msg: Any, fields: tuple[str, ...]) -> NDArray[np.float64]:
-    """(N, len(fields)) rows of a PointCloud2 of little-endian float64 columns with these names."""
-    names = tuple(str(f.name) for f in msg.fields)
-    if names != fields:
-        raise WireError(f"point cloud has fields {', '.join(names)}; expected {', '.join(fields)}")
-    rows = _bytes(msg.data)
-    if rows.size != int(msg.width) * int(msg.height) * 8 * len(fields):
+def decode_cloud(msg: Any, needed: Collection[str]) -> NDArray[np.void]:
+    """(N,) rows of a little-endian PointCloud2, one column per field; WireError without the needed ones."""
+    names = [str(f.name) for f in msg.fields]
+    missing = [name for name in needed if name not in names]
+    if missing or any(int(f.datatype) not in POINT_TYPES or int(f.count) != 1 for f in msg.fields):
+        raise WireError(f"point cloud has fields {', '.join(names)}; expected {', '.join(needed)}")
+    step, size = int(msg.point_step), int(msg.width) * int(msg.height)
+    data = _bytes(msg.data)
+    try:
+        row = np.dtype(
+            {
+                "names": names,
+                "formats": [POINT_TYPES[int(f.datatype)] for f in msg.fields],
+                "offsets": [int(f.offset) for f in msg.fields],
+                "itemsize": step,
+            }
+        )
+    except ValueError as error:
+        raise WireError(f"point cloud has fields that do not fit its rows ({error})") from error
+    if data.size != size * step:
         raise WireError("point cloud data does not fit its width and fields")
-    return rows.view("<f8").reshape(-1, len(fields)).astype(np.float64)
+    return data.view(row)
+
+
+def _columns(rows: NDArray[np.void], names: Sequence[str]) -> NDArray[np.float64]:
+    return np.column_stack([rows[name].astype(np.float64) for name in names])
 
 
 def decode_map(msg: Any) -> LocalMap:
     """The local map of a sensor_msgs/PointCloud2, one row per building."""
-    rows = decode_rows(msg, MAP_FIELDS)
-    return LocalMap(
-        stamp_ns(msg), rows[:, 0].astype(np.int64), rows[:, 1:3], rows[:, 3], rows[:, 4:8],
-        rows[:, 8].astype(np.int64),
+    rows = decode_cloud(msg, [str(name) for name in MAP_ROW.fields or () if name not in MAP_OPTIONAL])
+    local_map = LocalMap.whole(
+        stamp_ns(msg), rows["id"].astype(np.int64), _columns(rows, ("x", "y")),
+        rows["area"].astype(np.float64), _columns(rows, SHAPE_METRICS), rows["observations"].astype(np.int64),
     )  # fmt: skip
+    if not set(MAP_OPTIONAL) <= set(rows.dtype.names or ()):
+        return local_map
+    covariances = _columns(rows, ("covariance_xx", "covariance_xy", "covariance_xy", "covariance_yy"))
+    return replace(local_map, covariances_m2=covariances.reshape(-1, 2, 2), cut=rows["cut"] > 0)
 
 
 def decode_candidates(msg: Any) -> tuple[Candidate, ...]:
     """Ranked hypotheses of a sensor_msgs/PointCloud2, best first."""
-    return tuple(Candidate(*(float(v) for v in row)) for row in decode_rows(msg, CANDIDATE_FIELDS))
+    rows = _columns(decode_cloud(msg, CANDIDATE_FIELDS), CANDIDATE_FIELDS)
+    return tuple(Candidate(*row) for row in rows.tolist())
 
 
 def decode_fix(msg: Any) -> Fix | NoFix:

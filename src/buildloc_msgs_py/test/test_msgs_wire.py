@@ -14,6 +14,7 @@ from buildloc_msgs_py import encode, wire
 from buildloc_msgs_py.types import CameraModel, Candidate, Fix, Keyframe, LocalMap, Mask, NoFix
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.typesys import Stores, get_typestore
+from sensor_msgs.msg import PointField
 
 STAMP = 1_700_000_000_123_456_789
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -132,11 +133,55 @@ def test_keyframes(travel: Travel) -> None:
 @pytest.mark.parametrize("count", [0, 1, 5])
 def test_map(travel: Travel, count: int) -> None:
     rng = np.random.default_rng(count)
+    spread = rng.normal(size=(count, 2, 2))
     sent = LocalMap(
-        STAMP, np.arange(count, dtype=np.int64), rng.normal(size=(count, 2)) * 100,
+        STAMP, np.arange(count, dtype=np.int64) + 2**24, rng.normal(size=(count, 2)) * 5000,
         rng.uniform(20, 500, count), rng.uniform(size=(count, 4)), rng.integers(1, 9, count),
+        spread @ spread.swapaxes(1, 2), rng.uniform(size=count) < 0.5,
     )  # fmt: skip
-    same(wire.decode_map(travel(encode.encode_map(sent))), sent)
+    message = travel(encode.encode_map(sent))
+    received = wire.decode_map(message)
+    assert np.abs(received.centroids_m - sent.centroids_m).max(initial=0.0) < 1e-3  # float32 of kilometres
+    same(received, replace(sent, centroids_m=received.centroids_m))
+    unknown = LocalMap.whole(STAMP, sent.ids, received.centroids_m, *(
+        getattr(sent, name) for name in ("areas_m2", "shapes", "observations")
+    ))  # fmt: skip
+    same(wire.decode_map(travel(encode.encode_map(unknown))), unknown)
+
+
+@wires
+def test_rviz_can_draw_the_map(travel: Travel) -> None:
+    none = np.empty(0, dtype=np.int64)
+    empty = LocalMap.whole(STAMP, none, np.empty((0, 2)), np.empty(0), np.empty((0, 4)), none)
+    # Its only transformer of positions asks for these three, as FLOAT32.
+    kinds = {f.name: f.datatype for f in travel(encode.encode_map(empty)).fields}
+    assert [kinds[name] for name in ("x", "y", "z")] == [PointField.FLOAT32] * 3
+
+
+@wires
+def test_a_map_recorded_without_covariances_is_read(travel: Travel) -> None:
+    names = (
+        "id", "x", "y", "area", "compactness", "elongation", "rectangularity", "convexity", "observations",
+    )  # fmt: skip
+    rows = np.random.default_rng(1).integers(1, 9, (3, 9)).astype(np.float64)
+    row = np.dtype([(name, "<f8") for name in names])
+    received = wire.decode_map(travel(encode.encode_cloud(rows.view(row)[:, 0], STAMP, "buildloc_map")))
+    whole = LocalMap.whole(
+        STAMP, rows[:, 0].astype(int), rows[:, 1:3], rows[:, 3], rows[:, 4:8], rows[:, 8].astype(int)
+    )
+    same(received, whole)
+    assert not received.cut.any() and np.isnan(received.covariances_m2).all()
+
+
+@wires
+def test_a_cloud_that_does_not_fit_its_fields_is_refused(travel: Travel) -> None:
+    cloud = encode.encode_candidates((Candidate(3e5, 4.7e6, 1.0, 1.01, 12.5, 0.61, 1.7),), STAMP)
+    cloud.width = 2
+    with pytest.raises(wire.WireError, match="does not fit its width"):
+        wire.decode_candidates(travel(cloud))
+    cloud.width, cloud.point_step = 1, 8
+    with pytest.raises(wire.WireError, match="do not fit its rows"):
+        wire.decode_candidates(travel(cloud))
 
 
 @wires
