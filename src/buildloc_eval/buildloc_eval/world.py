@@ -80,7 +80,7 @@ class PictureWorld:
     @property
     def bounds_m(self) -> Box:
         """The whole picture."""
-        height, width = self._image.shape[:2]
+        height, width = self._shape
         return (
             self._left_m, self._top_m - height * self._gsd_m, self._left_m + width * self._gsd_m, self._top_m,
         )  # fmt: skip
@@ -88,38 +88,41 @@ class PictureWorld:
     def window(self, box_m: Box) -> Window:
         """The pixels that touch the box."""
         west, south, east, north = box_m
-        height, width = self._image.shape[:2]
+        height, width = self._shape
         c0, c1 = _pixels(west - self._left_m, east - self._left_m, self._gsd_m, width)
         r0, r1 = _pixels(self._top_m - north, self._top_m - south, self._gsd_m, height)
         if c1 <= c0 or r1 <= r0:
             raise WorldError("the flight leaves the orthophoto; shorten it or choose another region")
         left, top = self._left_m + c0 * self._gsd_m, self._top_m - r0 * self._gsd_m
-        return Window(self._image[r0:r1, c0:c1], left, top, self._gsd_m)
+        return Window(self._part(r0, r1, c0, c1), left, top, self._gsd_m)
+
+    @property
+    def _shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        height, width = self._image.shape[:2]
+        return height, width
+
+    def _part(self, r0: int, r1: int, c0: int, c1: int) -> ByteArray:
+        return self._image[r0:r1, c0:c1]
 
 
 class MirroredWorld(PictureWorld):
-    """A picture laid ``times`` side by side and one above the other, every second one mirrored, so that
-    ground goes on over the seams and no two places look alike."""
+    """A picture laid ``times`` side by side and one below the other, every second one mirrored: the ground
+    goes on over the seams, and of two times no two places look alike. The first is the picture itself."""
 
     def __init__(self, picture: PictureWorld, times: int) -> None:
         super().__init__(picture._image, picture.epsg, picture._left_m, picture._top_m, picture._gsd_m)
         self._times = times
 
     @property
-    def bounds_m(self) -> Box:
-        """All of them; the picture itself is at the top left."""
-        west, south, east, north = super().bounds_m
-        return west, north - self._times * (north - south), west + self._times * (east - west), north
+    def _shape(self) -> tuple[int, int]:
+        height, width = super()._shape
+        return self._times * height, self._times * width
 
-    def window(self, box_m: Box) -> Window:
-        """The pixels that touch the box."""
-        west, south, east, north = box_m
-        gsd, (height, width) = self._gsd_m, self._image.shape[:2]
-        c0, c1 = _pixels(west - self._left_m, east - self._left_m, gsd, self._times * width)
-        r0, r1 = _pixels(self._top_m - north, self._top_m - south, gsd, self._times * height)
+    def _part(self, r0: int, r1: int, c0: int, c1: int) -> ByteArray:
+        height, width = super()._shape
         rows, columns = _mirrored(np.arange(r0, r1), height), _mirrored(np.arange(c0, c1), width)
-        image = self._image[rows[:, None], columns[None, :]]
-        return Window(image, self._left_m + c0 * gsd, self._top_m - r0 * gsd, gsd)
+        return self._image[rows[:, None], columns[None, :]]
 
 
 class OrthoWorld(PictureWorld):
