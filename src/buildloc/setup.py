@@ -39,6 +39,8 @@ setup(
         "opencv-python-headless>=4.8,<6",
         "shapely>=2.0,<3",
         "geopandas>=1.0,<2",
+        "pyarrow>=14,<30",
+        "pyogrio>=0.10,<1",
         "PyYAML>=6,<7",
         "matplotlib>=3.6,<4",
         "rosbags>=0.11,<0.12",

@@ -21,8 +21,10 @@ setup(
     install_requires=[
         "buildloc_msgs_py",
         "numpy>=1.26,<3",
+        "scipy>=1.11,<2",
         "opencv-python-headless>=4.8,<6",
         "onnxruntime>=1.18,<2",
+        "shapely>=2.0,<3",
     ],
     extras_require={"ros": ["buildloc_msgs_py[ros]"], "test": ["pytest"]},
     entry_points={

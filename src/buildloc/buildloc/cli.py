@@ -60,6 +60,16 @@ def _count(text: str) -> int:
     return int(text)
 
 
+def _metres(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0.0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a length in metres above 0")
+    return value
+
+
 def _settings_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, help="YAML of ROS parameters")
     parser.add_argument(
@@ -188,26 +198,72 @@ def _empty_folder(path: Path) -> Path:
 
 
 def _segment(args: argparse.Namespace) -> int:
-    import cv2
+    from buildloc.images import is_bag
+
+    if not any(is_bag(path) for path in args.inputs):
+        return _segment_images(args)
+    if len(args.inputs) > 1:
+        raise BuildlocError("give one bag, or images and folders of images")
+    if args.gsd is not None:
+        raise BuildlocError("--gsd is for images; a bag has altitude and camera_info")
+    return _segment_bag(args)
+
+
+def _segment_images(args: argparse.Namespace) -> int:
+    from buildloc_segmenter.config import SegmenterConfig
+    from buildloc_segmenter.network import Network
+
+    from buildloc.images import ImageError, find_images, read_image, write_results
+    from buildloc.settings import SEGMENTER, config_of, load
+
+    paths = find_images(args.inputs)
+    if args.gsd is None:
+        raise BuildlocError(
+            "images do not tell metres per pixel; give --gsd M (height above ground / focal length in px)"
+        )
+    network = Network(config_of(load(args.config, args.overrides), SEGMENTER, SegmenterConfig))
+    doubt = network.doubt(args.gsd)
+    if doubt is not None:
+        print(f"warning: {doubt}", file=sys.stderr)
+    out, buildings, failed = _empty_folder(args.out), 0, 0
+    for number, path in enumerate(paths, start=1):
+        try:
+            image = read_image(path)
+        except ImageError as error:
+            failed += 1
+            _progress_end()
+            print(f"error: {error}", file=sys.stderr)
+            continue
+        found = network.segment_buildings(image, args.gsd)
+        write_results(found, image, out, path.stem, args.overlay)
+        buildings += len(found.buildings)
+        _progress(f"{number} of {len(paths)} images, {buildings} buildings")
+    _progress_end()
+    print(f"{out}: {buildings} buildings in {len(paths) - failed} of {len(paths)} images")
+    return 2 if failed else 0
+
+
+def _segment_bag(args: argparse.Namespace) -> int:
     from buildloc_msgs_py.pairing import FrameFault
     from buildloc_segmenter.config import SegmenterConfig
     from buildloc_segmenter.segmenter import Segmenter
 
+    from buildloc.images import write_results
     from buildloc.settings import SEGMENTER, config_of, load
 
     segmenter = Segmenter(config_of(load(args.config, args.overrides), SEGMENTER, SegmenterConfig))
     frames = faults = keyframes = 0
-    for frame in _frames(args.bag):
+    for frame in _frames(args.inputs[0]):
         if isinstance(frame, FrameFault):
             faults += 1
             continue
         if frames == 0:
             _empty_folder(args.out)
         frames += 1
-        mask = segmenter.process(frame)
-        if mask is not None:
+        if segmenter.select(frame):
             keyframes += 1
-            cv2.imwrite(str(args.out / f"{mask.stamp_ns}.png"), mask.pixels)
+            found = segmenter.segment_buildings(frame)
+            write_results(found, frame.image_bgr, args.out, str(frame.stamp_ns), args.overlay)
             _progress(f"{frames} frames, {keyframes} keyframes")
     print(f"{args.out}: {keyframes} masks of {frames} frames, {faults} frames unusable")
     return 0
@@ -408,8 +464,11 @@ def parser() -> argparse.ArgumentParser:
             refdb_commands, "info", "what a database holds", _refdb_info, _argument("database", type=Path)
         ),
         _command(
-            commands, "segment", "building masks of a bag's keyframes", _segment, bag,
-            _argument("--out", type=Path, required=True, help="folder for one PNG per keyframe"),
+            commands, "segment", "building masks and outlines of images, or of a bag's keyframes", _segment,
+            _argument("inputs", type=Path, nargs="+", metavar="INPUT", help="images, folders of them, a bag"),
+            _argument("-o", "--out", type=Path, required=True, help="folder for the results"),
+            _argument("--gsd", type=_metres, metavar="M", help="metres per pixel of the images"),
+            _argument("--overlay", action="store_true", help="the images with the outlines too"),
         ),
         _command(
             commands, "map", "map file and trajectory of a bag", _map, bag,

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 from buildloc_mapper.config import MapperConfig
-from buildloc_mapper.mapper import ORIGIN
 from buildloc_mapper.registration import Link, Registration
+from buildloc_mapper.similarity import Similarity
 from buildloc_msgs_py.types import FloatArray, Frame
 
 from buildloc_eval.flown import Flight, Path2d
@@ -47,7 +47,7 @@ def links(
 
 def chain(found: list[Link | None]) -> Path2d:
     """Consecutive links, one after the other, up to the first that is missing."""
-    poses = [ORIGIN]
+    poses = [Similarity(0.0, 0.0, 0.0, 1.0)]
     for link in found:
         if link is None:
             break

@@ -13,7 +13,7 @@ pytest.importorskip("rclpy", reason="ROS is not installed")
 import rclpy
 from buildloc_msgs_py.types import Frame, Mask
 from buildloc_msgs_py.wire import decode_mask, stamp_ns
-from buildloc_segmenter.network import NetworkError
+from buildloc_segmenter.network import TILE_PX, Network, NetworkError
 from buildloc_segmenter.segmenter_node import KEYFRAMES_WAITING, SegmenterNode
 from diagnostic_msgs.msg import DiagnosticStatus
 from drone import DEADLINE_S, SECOND, Drone, domain_id
@@ -56,7 +56,7 @@ def test_keyframes_are_masked_and_counted(flight: Flight) -> None:
     flight.until(lambda: flight.reported(DiagnosticStatus.OK, **wanted))
 
 
-def test_a_slow_network_loses_no_frame_and_says_which_keyframes_it_dropped(
+def test_a_slow_network_loses_no_frame_and_drops_the_oldest_keyframes_that_wait(
     flight: Flight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go = threading.Event()
@@ -69,12 +69,15 @@ def test_a_slow_network_loses_no_frame_and_says_which_keyframes_it_dropped(
     count = KEYFRAMES_WAITING + 3
     for i in range(count):
         flight.send(10 * i * SECOND)
-    figures = {"frames": count, "keyframes": KEYFRAMES_WAITING, "keyframes_dropped": 3}
+    figures = {"frames": count, "keyframes": KEYFRAMES_WAITING + 1, "keyframes_dropped": 2}
     flight.until(lambda: flight.reported(DiagnosticStatus.WARN, **figures))
     assert not flight.masks
     go.set()
-    flight.until(lambda: len(flight.masks) == KEYFRAMES_WAITING)
-    flight.until(lambda: flight.reported(DiagnosticStatus.OK, **figures))
+    flight.until(lambda: len(flight.masks) == KEYFRAMES_WAITING + 1)
+    flight.until(lambda: flight.reported(DiagnosticStatus.OK, **figures, keyframes_waiting=0))
+    # The first was being segmented; the oldest of those that waited made room for the newest.
+    wanted = [0, *range(3, count)]
+    assert [stamp_ns(mask) for mask in flight.masks] == [10 * i * SECOND for i in wanted]
 
 
 @pytest.mark.parametrize("error", [NetworkError("net.onnx: does not run"), MemoryError("too large")])
@@ -102,3 +105,30 @@ def test_a_frame_without_height_is_reported_and_the_next_one_is_masked(flight: F
     assert any("altitude" in status.message for status in flight.statuses)
     flight.send(3 * SECOND)
     flight.until(lambda: len(flight.masks) == 1)
+
+
+def test_a_flight_too_high_for_the_network_is_masked_with_a_warning(flight: Flight) -> None:
+    flight.send(1 * SECOND, altitude_m=300.0)  # 3 m per pixel
+    flight.until(lambda: flight.reported(DiagnosticStatus.WARN, keyframes=1, keyframes_waiting=0))
+    assert len(flight.masks) == 1
+    assert any("3 m per pixel, outside of the 0.1 to 0.5 m" in status.message for status in flight.statuses)
+
+
+def test_the_provider_that_runs_is_reported(flight: Flight) -> None:
+    flight.send(1 * SECOND)
+    flight.until(lambda: len(flight.masks) == 1)
+    values = {v.key: v.value for v in flight.states["segmenter_node"].values}
+    assert values["provider"] == "CPUExecutionProvider"
+
+
+def test_the_network_is_warm_before_the_node_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes: list[tuple[int, ...]] = []
+    real = Network._run
+    monkeypatch.setattr(Network, "_run", lambda self, tile: (sizes.append(tile.shape), real(self, tile))[1])
+    context = Context()
+    rclpy.init(context=context, domain_id=domain_id())
+    try:
+        SegmenterNode(context=context).destroy_node()
+    finally:
+        rclpy.try_shutdown(context=context)
+    assert (TILE_PX, TILE_PX, 3) in sizes

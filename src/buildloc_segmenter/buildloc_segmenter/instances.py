@@ -1,0 +1,140 @@
+"""From the scores of pixels to buildings: one label per building, a mask that keeps them apart.
+
+Everything here is at the network's ground sampling distance; a score is a logit, above 0 for yes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from buildloc_msgs_py.types import ByteArray
+from numpy.typing import NDArray
+
+FloatImage = NDArray[np.float32]
+LabelImage = NDArray[np.int32]
+
+# Where a network marks no cores, they are what is left of the mask when so much is taken off its edge.
+CORE_INSET_M = 0.6
+MIN_CORE_M2 = 1.0  # smaller ones are noise: a shed of 8 m2 has a core of 2.6 m2
+# The line between touching buildings on the wire. The mapper fuses at 0.25 m per pixel, with neighbours
+# across corners connected: anything narrower than 0.25 m times the root of two would leak there.
+GAP_M = 0.4
+GAP_PX = 1.5  # of the image: its own neighbours across corners
+GROUND = 1  # the watershed's marker of what is no building
+SQUARE = np.ones((3, 3), np.uint8)
+MAX_LOGIT = 4.0  # beyond it a pixel is as sure as its neighbour: edges stay in the middle between two
+
+
+@dataclass(frozen=True)
+class Instances:
+    """The buildings of an image.
+
+    ``labels`` (h, w) int32: 0 ground, 1 to N the buildings. ``building`` (h, w) float32: the score of each
+    pixel, above 0 where the network saw a building. ``between`` (h, w) bool: the line between touching
+    buildings, which a mask leaves out. ``gsd_m`` metres per pixel.
+    """
+
+    labels: LabelImage
+    building: FloatImage
+    between: NDArray[np.bool_]
+    gsd_m: float
+
+    def __len__(self) -> int:
+        return int(self.labels.max(initial=0))
+
+    def margin(self) -> FloatImage:
+        """(h, w) how surely a pixel is on its side of the outline, > 0: it places edges between pixels."""
+        return np.clip(np.abs(self.building), 0.5, MAX_LOGIT)
+
+
+def find_instances(
+    building: FloatImage, core: FloatImage | None, gsd_m: float, min_area_m2: float, image_gsd_m: float
+) -> Instances:
+    """Split a building score (h, w) into buildings, by the score of their cores where there is one.
+
+    A core is what lies well inside one building; touching roofs have separate ones. Each grows in its
+    connected part of the mask until it meets the next. A part without a core is one building. Holes and
+    buildings below ``min_area_m2`` are removed. ``image_gsd_m`` is that of the image the mask is for.
+    """
+    min_px = min_area_m2 / gsd_m**2
+    mask = fill_holes((building > 0.0).astype(np.uint8), min_px)
+    cores = _cores(mask, core, gsd_m)
+    grown = _flood(mask, _markers(mask, cores, MIN_CORE_M2 / gsd_m**2))
+    labels = np.where(mask > 0, grown, 0)
+    kept = np.bincount(labels.ravel(), minlength=1) >= max(min_px, 1.0)
+    kept[0] = False
+    number = np.where(kept, np.cumsum(kept), 0).astype(np.int32)
+    gap_m = max(GAP_M, GAP_PX * image_gsd_m)
+    between = _between(number[grown], max(1, round(0.5 * gap_m / gsd_m)))
+    return Instances(number[labels], building, between, gsd_m)
+
+
+def _cores(mask: ByteArray, core: FloatImage | None, gsd_m: float) -> ByteArray:
+    if core is not None:
+        return mask & (core > 0.0)
+    return (cv2.distanceTransform(mask, cv2.DIST_L2, 3) * gsd_m > CORE_INSET_M).astype(np.uint8)
+
+
+def _markers(mask: ByteArray, cores: ByteArray, min_core_px: float) -> LabelImage:
+    """(h, w) 0 where the watershed decides, else a number above GROUND per building to be."""
+    count, markers, stats, _ = cv2.connectedComponentsWithStats(cores, connectivity=4)
+    real = stats[:, cv2.CC_STAT_AREA] >= min_core_px
+    real[0] = False
+    markers = np.where(real, np.arange(count, dtype=np.int32) + GROUND, 0)[markers]
+    parts, part = cv2.connectedComponents(mask, connectivity=8)
+    bare = np.ones(parts, dtype=bool)
+    bare[part[markers > 0]] = False
+    bare[0] = False
+    return np.where(bare[part], part + np.int32(count + GROUND), markers)
+
+
+def _flood(mask: ByteArray, markers: LabelImage) -> LabelImage:
+    """(h, w) the markers, less GROUND, grown over the mask and one pixel around it."""
+    # OpenCV draws its line around the image too: a pixel more on each side is there for that.
+    region = cv2.copyMakeBorder(cv2.dilate(mask, SQUARE), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
+    seeds = np.where(region > 0, np.pad(markers, 1), np.int32(GROUND))
+    # OpenCV floods across small differences first: the markers share the mask before the ground enters it.
+    cv2.watershed(cv2.cvtColor(region * np.uint8(255), cv2.COLOR_GRAY2BGR), seeds)
+    labels = np.maximum(seeds - GROUND, 0).astype(np.float32)  # OpenCV dilates no int32
+    filled = np.where((seeds < 0) & (region > 0), cv2.dilate(labels, SQUARE), labels)
+    return filled[1:-1, 1:-1].astype(np.int32)
+
+
+def _between(labels: LabelImage, reach_px: int) -> NDArray[np.bool_]:
+    """(h, w) pixels within reach of another building."""
+    kernel = np.ones((2 * reach_px + 1, 2 * reach_px + 1), np.uint8)
+    values = labels.astype(np.float32)
+    low = cv2.erode(np.where(labels > 0, values, np.float32(np.inf)), kernel)
+    return cv2.dilate(values, kernel) > low
+
+
+def fill_holes(mask: ByteArray, max_px: float) -> ByteArray:
+    """(h, w) 0 or 1, with the holes below ``max_px`` filled: background that is enclosed by building."""
+    height, width = mask.shape
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(1 - mask, connectivity=4)
+    x, y, w, h, area = stats.T
+    hole = (area < max_px) & (x > 0) & (y > 0) & (x + w < width) & (y + h < height)
+    hole[0] = False
+    return np.asarray(mask | hole[labels], dtype=np.uint8)
+
+
+def draw_mask(instances: Instances, size: tuple[int, int]) -> ByteArray:
+    """(H, W) uint8, 0 or 255, of ``size`` (width, height); touching buildings have a line between them."""
+    inside = (instances.labels > 0) & ~instances.between
+    margin = instances.margin()
+    field = cv2.resize(np.where(inside, margin, -margin), size, interpolation=cv2.INTER_LINEAR)
+    return (field > 0.0).astype(np.uint8) * np.uint8(255)
+
+
+def owned(instances: Instances, window: tuple[float, float, float, float]) -> Instances:
+    """Those whose centroid lies in a window (left, top, right, bottom), pixels, keeping their numbers."""
+    left, top, right, bottom = window
+    rows, columns = np.nonzero(instances.labels)
+    numbers = instances.labels[rows, columns]
+    areas = np.bincount(numbers, minlength=1)
+    x = np.bincount(numbers, columns, len(areas)) / np.maximum(areas, 1)
+    y = np.bincount(numbers, rows, len(areas)) / np.maximum(areas, 1)
+    mine = (x >= left) & (x < right) & (y >= top) & (y < bottom)
+    return replace(instances, labels=np.where(mine[instances.labels], instances.labels, 0))

@@ -1,0 +1,143 @@
+"""One label per building, the line between touching ones, and blocks, on hand-drawn scores."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from buildloc_segmenter.instances import Instances, draw_mask, fill_holes, find_instances, owned
+from buildloc_segmenter.tiles import blocks
+
+GSD_M = 0.2
+Box = tuple[int, int, int, int]  # left, top, right, bottom; pixels
+
+
+def scores(*boxes: Box, inset: int = 0, size: tuple[int, int] = (80, 120)) -> np.ndarray:
+    """Logits of 5 in the boxes, made smaller by ``inset``, and -5 elsewhere."""
+    image = np.full(size, -5.0, dtype=np.float32)
+    for left, top, right, bottom in boxes:
+        image[top + inset : bottom - inset, left + inset : right - inset] = 5.0
+    return image
+
+
+def found(building: np.ndarray, core: np.ndarray | None = None, min_area_m2: float = 8.0) -> Instances:
+    return find_instances(building, core, GSD_M, min_area_m2, image_gsd_m=0.1)
+
+
+def parts(mask: np.ndarray) -> int:
+    return int(cv2.connectedComponents(mask, connectivity=8)[0]) - 1
+
+
+TERRACE: tuple[Box, ...] = ((20, 20, 60, 60), (60, 20, 90, 60), (90, 30, 110, 50))
+
+
+def test_touching_roofs_are_split_where_their_cores_say() -> None:
+    instances = found(scores(*TERRACE), scores(*TERRACE, inset=3))
+    assert len(instances) == 3
+    for left, top, right, bottom in TERRACE:
+        (number,) = np.unique(instances.labels[top + 3 : bottom - 3, left + 3 : right - 3])
+        true = np.zeros(instances.labels.shape, dtype=bool)
+        true[top:bottom, left:right] = True
+        same = instances.labels == number
+        assert (same & true).sum() / (same | true).sum() > 0.94  # one pixel of line goes to either side
+    assert ((instances.labels > 0) == (scores(*TERRACE) > 0)).all()
+
+
+def test_without_cores_a_narrow_neck_is_split_and_a_wall_is_not() -> None:
+    # Two roofs of 8 x 8 m that touch along 0.8 m, and a house with a wing of 4 m.
+    assert len(found(scores((10, 20, 50, 60), (50, 38, 52, 42), (52, 20, 92, 60)))) == 2
+    assert len(found(scores((10, 20, 50, 60), (50, 30, 90, 50)))) == 1
+
+
+def test_a_part_without_a_core_is_one_building() -> None:
+    instances = found(scores((10, 10, 40, 40), (60, 10, 90, 40)), scores((10, 10, 40, 40), inset=3))
+    assert len(instances) == 2 and len(np.unique(instances.labels[10:40, 60:90])) == 1
+
+
+def test_a_core_that_is_a_speck_splits_nothing() -> None:
+    core = scores((10, 10, 60, 50), inset=3)
+    core[30, 20:60] = -5.0  # a roof ridge across the core ...
+    core[28:33, 55:57] = -5.0
+    core[30, 58] = 5.0  # ... and a speck of core at its end
+    assert len(found(scores((10, 10, 60, 50)), core)) == 1
+
+
+@pytest.mark.parametrize(("zoom", "gap_m"), [(2.0, 0.4), (1.0, 0.4), (0.4, 0.75)])
+def test_the_mask_keeps_touching_buildings_apart_at_any_size(zoom: float, gap_m: float) -> None:
+    pixel_m = GSD_M / zoom
+    instances = find_instances(scores(*TERRACE), scores(*TERRACE, inset=3), GSD_M, 8.0, pixel_m)
+    height, width = (round(side * zoom) for side in instances.labels.shape)
+    mask = draw_mask(instances, (width, height))
+    assert mask.shape == (height, width) and set(np.unique(mask)) == {0, 255}
+    assert parts(mask) == 3
+    row = mask[round(25 * zoom), round(30 * zoom) : round(80 * zoom)]  # through the first two roofs
+    assert (row == 0).sum() * pixel_m >= min(gap_m, 1.0) - pixel_m / 2
+
+
+def test_a_slanted_line_keeps_buildings_apart_in_the_mappers_raster() -> None:
+    rows, columns = np.mgrid[:80, :120]
+    side = (columns - 60) * 0.8 + (rows - 40) * 0.6
+    core = np.where(np.abs(side) > 3, scores((10, 10, 110, 70), inset=3), -5.0).astype(np.float32)
+    instances = found(scores((10, 10, 110, 70)), core)
+    assert len(instances) == 2
+    full = draw_mask(instances, (240, 160))  # 0.1 m per pixel
+    assert parts(full) == 2
+    at_map = cv2.resize(full, (96, 64), interpolation=cv2.INTER_LINEAR) > 127  # 0.25 m per pixel
+    assert parts(at_map.astype(np.uint8)) == 2
+
+
+def test_small_buildings_and_holes_go_and_the_numbers_stay_without_gaps() -> None:
+    image = scores((10, 10, 40, 40), (60, 10, 66, 16), (60, 40, 90, 70))  # 36, 1.4 and 36 m2
+    image[20:22, 20:22] = -5.0
+    instances = found(image)
+    assert len(instances) == 2 and set(np.unique(instances.labels)) == {0, 1, 2}
+    assert instances.labels[21, 21] > 0 and instances.labels[12, 62] == 0
+    mask = draw_mask(instances, (120, 80))
+    assert mask[21, 21] == 255 and mask[12, 62] == 0 and (mask > 0).sum() == 1800
+
+
+def test_only_enclosed_background_is_a_hole() -> None:
+    # Close to the ground the whole picture is smaller than the smallest building: it stays empty.
+    assert fill_holes(np.zeros((40, 60), dtype=np.uint8), 1e6).max() == 0
+    mask = np.ones((40, 60), dtype=np.uint8)
+    mask[:3, :3] = 0  # a corner of ground
+    mask[20:23, 20:23] = 0
+    filled = fill_holes(mask, 50)
+    assert filled[0, 0] == 0 and filled[21, 21] == 1
+
+
+def test_an_image_of_ground_and_one_of_roof() -> None:
+    assert len(found(np.full((40, 60), -5.0, dtype=np.float32))) == 0
+    roof = found(np.full((40, 60), 5.0, dtype=np.float32))
+    assert len(roof) == 1 and draw_mask(roof, (60, 40)).min() == 255
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_quarter_turns_turn_the_buildings(turns: int) -> None:
+    rng = np.random.default_rng(turns)
+    noise = cv2.GaussianBlur(rng.normal(0.0, 40.0, (90, 130)).astype(np.float32), (0, 0), 5)
+    upright, turned = found(noise), found(np.ascontiguousarray(np.rot90(noise, turns)))
+    assert len(upright) == len(turned) > 2
+    # The flood decides ties in the order of rows: the line between two may move by a pixel.
+    assert ((np.rot90(upright.labels, turns) > 0) != (turned.labels > 0)).mean() < 1e-3
+    areas = [np.sort(np.bincount(image.labels.ravel())) for image in (upright, turned)]
+    assert np.abs(areas[0] - areas[1]).max() < 0.02 * areas[0].max()
+
+
+def test_blocks_share_out_the_buildings_of_an_image() -> None:
+    boxes = tuple((x, y, x + 14, y + 14) for x in range(3, 280, 20) for y in range(3, 180, 20))
+    whole = scores(*boxes, size=(190, 300))
+    mask = np.zeros((190, 300), dtype=np.uint8)
+    count = 0
+    for block in blocks(190, 300, 100, 40):
+        window = np.s_[block.rows, block.columns]
+        mine = owned(found(np.ascontiguousarray(whole[window]), min_area_m2=1.0), block.own_in_window(1.0))
+        count += len(np.unique(mine.labels)) - 1
+        mask[window] |= draw_mask(mine, mine.labels.shape[::-1])
+    assert count == len(boxes)
+    assert ((mask > 0) == (whole > 0)).all()
+
+
+def test_one_block_is_all_of_a_small_image() -> None:
+    (block,) = blocks(50, 70, 100, 40)
+    assert block.is_all and (block.rows, block.columns) == (slice(0, 50), slice(0, 70))

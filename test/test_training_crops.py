@@ -1,0 +1,121 @@
+"""Training crops and their targets: what is drawn, turned and weathered keeps true labels. No PyTorch."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from augment import augmented, coarse, colours, snow
+from buildloc_eval.places import Scene
+from crops import CROP_PX, CropConfig, CropSampler, core
+from rendered import decoys, rectangle, render
+
+PLAIN = CropConfig(rendered_share=0.0, decoy_share=0.0)
+
+
+def two_touching_squares() -> np.ndarray:
+    labels = np.zeros((40, 60), dtype=np.int32)
+    labels[10:30, 10:30] = 1
+    labels[10:30, 30:50] = 2
+    return labels
+
+
+def test_cores_of_touching_buildings_lie_apart_by_twice_the_depth() -> None:
+    found = core(two_touching_squares(), gsd_m=0.2)
+    assert found[20, 13:27].all() and found[20, 33:47].all()
+    assert not found[20, 27:33].any()
+    assert cv2.connectedComponents(found.astype(np.uint8))[0] - 1 == 2
+
+
+def test_a_building_thinner_than_two_depths_has_no_core() -> None:
+    labels = np.zeros((20, 40), dtype=np.int32)
+    labels[8:13, 5:35] = 1
+    assert not core(labels, gsd_m=0.2).any()
+
+
+def test_a_rendered_town_depends_on_its_seed_alone() -> None:
+    first, again, other = (render(96, 0.2, np.random.default_rng(seed)) for seed in (3, 3, 4))
+    assert np.array_equal(first[0], again[0]) and np.array_equal(first[1], again[1])
+    assert not np.array_equal(first[0], other[0])
+    assert first[0].min() >= 0.0 and first[0].max() <= 255.0
+
+
+def test_rendered_buildings_are_numbered_without_gaps() -> None:
+    for seed in range(8):
+        labels = render(128, 0.2, np.random.default_rng(seed))[1]
+        numbers = np.unique(labels[labels > 0])
+        assert numbers.max(initial=0) <= labels.max()
+        assert (numbers >= 1).all()
+
+
+def test_decoys_leave_every_roof_untouched() -> None:
+    rng = np.random.default_rng(5)
+    rgb = rng.uniform(0.0, 255.0, (80, 80, 3)).astype(np.float32)
+    labels = np.zeros((80, 80), dtype=np.int32)
+    labels[20:50, 30:70] = 1
+    before = rgb.copy()
+    changed = [decoys(rgb, labels, 0.2, np.random.default_rng(seed)) for seed in range(5)]
+    assert np.array_equal(rgb, before)
+    assert all(np.array_equal(out[labels > 0], rgb[labels > 0]) for out in changed)
+    assert any((out != rgb).any() for out in changed)
+
+
+def test_weather_and_camera_keep_shape_type_and_range() -> None:
+    rgb, labels = render(64, 0.2, np.random.default_rng(1))
+    for seed in range(30):
+        out = augmented(rgb, labels, 0.2, np.random.default_rng(seed))
+        assert out.shape == rgb.shape and out.dtype == np.float32
+        assert np.isfinite(out).all() and out.min() >= 0.0 and out.max() <= 255.0
+
+
+def test_snow_brightens_and_colours_change_with_the_seed() -> None:
+    rgb = np.full((64, 64, 3), 80.0, dtype=np.float32)
+    labels = np.zeros((64, 64), dtype=np.int32)
+    assert max(snow(rgb, labels, np.random.default_rng(seed)).mean() for seed in range(5)) > 120.0
+    assert not np.allclose(colours(rgb, np.random.default_rng(0)), colours(rgb, np.random.default_rng(1)))
+
+
+def test_a_coarser_picture_loses_detail_and_keeps_its_mean() -> None:
+    rgb = np.random.default_rng(2).uniform(0.0, 255.0, (64, 64, 3)).astype(np.float32)
+    out = coarse(rgb, 0.1, np.random.default_rng(0))
+    assert out.std() < 0.7 * rgb.std()
+    assert out.mean() == pytest.approx(rgb.mean(), rel=0.05)
+
+
+def white_roofs(gsd_m: float) -> Scene:
+    """Black ground with white roofs: the picture is the label."""
+    labels = np.zeros((900, 900), dtype=np.int32)
+    rng = np.random.default_rng(0)
+    for number in range(1, 60):
+        outline = rectangle(
+            rng.uniform(50, 850, 2), rng.uniform(40, 90), rng.uniform(30, 60), rng.uniform(0, 3)
+        )
+        cv2.fillPoly(labels, [outline.round().astype(np.int32)], number)
+    rgb = np.repeat(((labels > 0) * 255).astype(np.uint8)[:, :, None], 3, axis=2)
+    return Scene("white", gsd_m, rgb, labels, np.ones(labels.shape, dtype=np.bool_))
+
+
+def test_labels_follow_the_picture_at_any_scale_heading_and_tilt(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("crops.augmented", lambda rgb, labels, gsd_m, rng: rgb)
+    for gsd in (0.1, 0.2, 0.3):
+        rgb, target, weight = CropSampler([white_roofs(gsd)], PLAIN, seed=1).batch(0, 6)
+        known = weight[:, 0] > 0
+        seen = (rgb[:, 0] > 127) == (target[:, 0] > 0)
+        assert seen[known].mean() > 0.985
+        assert 0.05 < target[:, 0][known].mean() < 0.6
+        assert (target[:, 1] <= target[:, 0]).all()
+
+
+def test_ground_outside_the_scene_has_no_weight() -> None:
+    small = white_roofs(0.2).part(slice(0, 150), slice(0, 150), "corner")
+    weight = CropSampler([small], PLAIN, seed=1).batch(0, 4)[2]
+    assert weight.shape == (4, 1, CROP_PX, CROP_PX)
+    assert 0.05 < weight.mean() < 0.9
+
+
+def test_a_batch_depends_on_seed_and_step_alone_so_that_a_run_resumes() -> None:
+    config = CropConfig(rendered_scenes=2)
+    first, again = (CropSampler([white_roofs(0.2)], config, seed=7) for _ in range(2))
+    first.batch(0, 2)
+    for mine, theirs in zip(first.batch(5, 3), again.batch(5, 3), strict=True):
+        assert np.array_equal(mine, theirs)

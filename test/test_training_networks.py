@@ -1,0 +1,112 @@
+"""Networks train, resume and export. Needs training/requirements.txt; skips without PyTorch."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+
+torch = pytest.importorskip(
+    "torch", reason="PyTorch is not installed: pip install -r training/requirements.txt"
+)
+pytest.importorskip("efficientnet_lite_pytorch", reason="pip install -r training/requirements.txt")
+pytest.importorskip("transformers", reason="pip install -r training/requirements.txt")
+
+
+def batch(seed: int, count: int = 2, side: int = 64) -> tuple[Any, Any, Any]:
+    """White squares on dark noise, building and core."""
+    rng = np.random.default_rng(seed)
+    rgb = rng.uniform(0.0, 90.0, (count, 3, side, side)).astype(np.float32)
+    target = np.zeros((count, 2, side, side), dtype=np.float32)
+    for k in range(count):
+        y, x = rng.integers(4, side // 2, 2)
+        rgb[k, :, y : y + 24, x : x + 24] += 150.0
+        target[k, 0, y : y + 24, x : x + 24] = 1.0
+        target[k, 1, y + 3 : y + 21, x + 3 : x + 21] = 1.0
+    return torch.from_numpy(rgb), torch.from_numpy(target), torch.ones((count, 1, side, side))
+
+
+def trained(name: str, steps: int, total: int = 30) -> tuple[Any, list[float]]:
+    from networks import network
+    from train import Training
+
+    torch.manual_seed(0)
+    training = Training(network(name), total, torch.device("cpu"))
+    training.net.train()
+    return training, [float(training.advance(*batch(step))[0].sum()) for step in range(steps)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["lite0", "segformer-b0"])
+def test_a_network_learns_squares_and_exports_what_it_learnt(name: str, tmp_path: Path) -> None:
+    from export import parity, write_onnx
+
+    training, losses = trained(name, 20)
+    assert max(losses[-4:]) < min(losses[:4])
+    path = tmp_path / "model.onnx"
+    write_onnx(training.average, path, {"places": ["squares"]})
+    report = parity(training.average, path, batch(99)[0].numpy())
+    assert report["equal_mask_share"] >= 0.999
+    assert report["max_difference"] < 1e-2
+    carried = {p.key: json.loads(p.value) for p in onnx.load(str(path)).metadata_props}
+    assert carried["buildloc"]["channels"] == ["building", "core"]
+    assert carried["buildloc_training"] == {"places": ["squares"]}
+
+
+@pytest.mark.slow
+def test_a_run_resumes_where_it_was_and_refuses_other_settings(tmp_path: Path) -> None:
+    from networks import network
+    from train import Training
+
+    whole, _ = trained("lite0", 4)
+    part, _ = trained("lite0", 2)
+    checkpoint = tmp_path / "checkpoint.pt"
+    part.save(checkpoint, {"seed": 1})
+    resumed = Training(network("lite0"), 30, torch.device("cpu"))
+    resumed.restore(checkpoint, {"seed": 1})
+    resumed.net.train()
+    for step in (2, 3):
+        resumed.advance(*batch(step))
+    theirs = resumed.average.state_dict()
+    for name, value in whole.average.state_dict().items():
+        assert torch.allclose(value.float(), theirs[name].float(), atol=1e-5), name
+    with pytest.raises(SystemExit, match="choose another --out"):
+        resumed.restore(checkpoint, {"seed": 2})
+
+
+@pytest.mark.slow
+def test_int8_says_nearly_the_same(tmp_path: Path) -> None:
+    from export import agreement, quantise, write_onnx
+
+    training, _ = trained("lite0", 20)
+    full, int8 = tmp_path / "model.onnx", tmp_path / "int8.onnx"
+    write_onnx(training.average, full, {})
+    rgb = batch(50, count=8)[0].numpy()
+    quantise(full, int8, rgb, {})
+    outputs = [onnxruntime.InferenceSession(str(p)).run(None, {"rgb": rgb})[0] for p in (full, int8)]
+    assert agreement(*outputs)["equal_mask_share"] > 0.97
+    assert int8.stat().st_size < 0.4 * full.stat().st_size
+
+
+@pytest.mark.slow
+def test_the_papers_network_is_exported_and_runs(tmp_path: Path) -> None:
+    from export import write_onnx
+    from networks import network
+
+    path = tmp_path / "b5.onnx"
+    write_onnx(network("segformer-b5"), path, {})
+    (logits,) = onnxruntime.InferenceSession(str(path)).run(None, {"rgb": batch(0, 1, 128)[0].numpy()})
+    assert logits.shape == (1, 2, 32, 32)
+    assert np.isfinite(logits).all()
+
+
+def test_an_unknown_network_is_refused() -> None:
+    from networks import network
+
+    with pytest.raises(SystemExit, match="choose lite0 or segformer"):
+        network("resnet")

@@ -1,0 +1,345 @@
+"""Rendered ground: towns drawn at random, labels exact.
+
+Labelled imagery with a licence is scarce and tropical. What it lacks is drawn here at random and mixed in:
+pitched roofs in any colour, driveways, patios, car parks and roads that are no roofs, trees, shadows.
+Nothing is drawn after any real place.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.float32]  # (H, W, 3) RGB, 0-255
+Labels = NDArray[np.int32]
+Points = NDArray[np.float64]
+
+GROUNDS = np.array(
+    [
+        [74, 92, 58],
+        [92, 108, 66],
+        [58, 76, 48],
+        [128, 122, 84],
+        [150, 138, 104],
+        [138, 112, 84],
+        [176, 158, 128],
+    ],
+    dtype=np.float32,
+)  # lawns, meadow, dry grass, soil, sand
+PAVINGS = np.array(
+    [[96, 98, 100], [122, 122, 120], [148, 146, 140], [178, 174, 166], [136, 124, 112], [158, 132, 112]],
+    dtype=np.float32,
+)  # asphalt old and new, concrete, gravel, brick
+ROOFS = np.array(
+    [
+        [70, 72, 78],
+        [96, 98, 104],
+        [150, 150, 152],
+        [198, 198, 198],
+        [152, 84, 62],
+        [186, 108, 76],
+        [118, 66, 52],
+        [128, 104, 84],
+        [88, 108, 140],
+        [92, 130, 110],
+        [214, 206, 190],
+        [60, 54, 52],
+    ],
+    dtype=np.float32,
+)  # slate, felt, metal, tiles, brown, painted
+CARS = np.array(
+    [[230, 230, 230], [40, 42, 46], [120, 124, 130], [150, 40, 36], [40, 60, 120]], dtype=np.float32
+)
+SUBPIXEL = 4
+
+
+def noise(rng: np.random.Generator, side: int, coarsest_px: int) -> Image:
+    """(side, side) noise of unit deviation, correlated over up to ``coarsest_px``."""
+    total = np.zeros((side, side), dtype=np.float32)
+    step = coarsest_px
+    while step >= 1:
+        coarse = rng.standard_normal((side // step + 2,) * 2).astype(np.float32)
+        fine = cv2.resize(coarse, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)
+        total += fine[:side, :side] * (step / coarsest_px) ** 0.5
+        step //= 3
+    return total / total.std()
+
+
+def _draw(plane: NDArray[np.uint8], outline: Points) -> None:
+    cv2.fillPoly(plane, [np.round(outline * 2**SUBPIXEL).astype(np.int32)], 1, cv2.LINE_8, SUBPIXEL)
+
+
+def _inside(shape: tuple[int, ...], outline: Points) -> NDArray[np.bool_]:
+    plane = np.zeros(shape[:2], dtype=np.uint8)
+    _draw(plane, outline)
+    return plane > 0
+
+
+def rectangle(centre: Points, length: float, width: float, angle: float) -> Points:
+    """Corners (4, 2) of a rectangle, its length along ``angle``."""
+    along = np.array([math.cos(angle), math.sin(angle)]) * length / 2.0
+    across = np.array([-math.sin(angle), math.cos(angle)]) * width / 2.0
+    return centre + np.array([along + across, -along + across, -along - across, along - across])
+
+
+@dataclass(frozen=True)
+class Light:
+    """Direction of the shadows in the picture, shadow length per height, darkness of the shade."""
+
+    away: Points
+    stretch: float
+    shade: float
+
+    @staticmethod
+    def drawn(rng: np.random.Generator) -> Light:
+        """A sun anywhere from high to low, or an overcast sky."""
+        angle = rng.uniform(0.0, math.tau)
+        shade = rng.uniform(0.25, 0.6) if rng.random() < 0.8 else rng.uniform(0.8, 1.0)
+        return Light(np.array([math.cos(angle), math.sin(angle)]), rng.uniform(0.3, 1.6), shade)
+
+
+class Canvas:
+    """A picture under construction: RGB, and the building of each pixel."""
+
+    def __init__(self, side_px: int, gsd_m: float, rng: np.random.Generator) -> None:
+        self.rng, self.side, self.gsd, self.light = rng, side_px, gsd_m, Light.drawn(rng)
+        self.labels: Labels = np.zeros((side_px, side_px), dtype=np.int32)
+        fine, coarse = noise(rng, side_px, 9), noise(rng, side_px, 81)
+        first, second = GROUNDS[rng.integers(len(GROUNDS), size=2)]
+        blend = 1.0 / (1.0 + np.exp(-rng.uniform(1.0, 4.0) * coarse))[:, :, None]
+        self.rgb: Image = first * (1.0 - blend) + second * blend
+        self.fine = fine[:, :, None]
+        self.rgb += self.fine * rng.uniform(2.0, 12.0)
+
+    def place(self) -> Points:
+        """A random place."""
+        return self.rng.uniform(0.0, self.side, 2)
+
+    def px(self, low_m: float, high_m: float) -> float:
+        """A random length."""
+        return float(self.rng.uniform(low_m, high_m)) / self.gsd
+
+    def paint(self, outline: Points, colour: Image, roughness: float, ground_only: bool = True) -> None:
+        """Fill an outline with a rough colour, not over roofs when ``ground_only``."""
+        where = _inside(self.labels.shape, outline)
+        if ground_only:
+            where &= self.labels == 0
+        self.rgb[where] = colour + self.fine[where] * roughness
+
+    def shade(self, outline: Points, height_px: float) -> None:
+        """Darken the ground that a body of this outline and height casts its shadow on."""
+        tip = outline + self.light.away * height_px * self.light.stretch
+        hull = cv2.convexHull(np.vstack([outline, tip]).astype(np.float32))[:, 0].astype(np.float64)
+        where = _inside(self.labels.shape, hull) & (self.labels == 0)
+        self.rgb[where] *= self.light.shade
+
+    def car(self, centre: Points, angle: float) -> None:
+        """A parked car."""
+        length, width = self.px(3.8, 5.2), self.px(1.6, 2.0)
+        body = rectangle(centre, length, width, angle)
+        self.shade(body, 1.4 / self.gsd)
+        colour = CARS[self.rng.integers(len(CARS))] * self.rng.uniform(0.8, 1.1)
+        self.paint(body, colour, 3.0)
+        self.paint(rectangle(centre, length * 0.45, width * 0.8, angle), colour * 0.5, 2.0)
+
+    def paving(self) -> Image:
+        """A colour of road, yard or terrace."""
+        return PAVINGS[self.rng.integers(len(PAVINGS))] * self.rng.uniform(0.7, 1.25)
+
+    def road(self, centre: Points, angle: float) -> None:
+        """A road through the picture, at times with pavements and a marking."""
+        width, colour = self.px(3.0, 9.0), self.paving()
+        if self.rng.random() < 0.4:
+            self.paint(
+                rectangle(centre, 3.0 * self.side, width + self.px(2.0, 5.0), angle), self.paving(), 4.0
+            )
+        self.paint(rectangle(centre, 3.0 * self.side, width, angle), colour, 4.0)
+        if self.rng.random() < 0.4:
+            self.paint(rectangle(centre, 3.0 * self.side, 0.15 / self.gsd, angle), colour * 0 + 220, 4.0)
+        for _ in range(self.rng.integers(0, 4)):
+            side = np.array([-math.sin(angle), math.cos(angle)]) * width * self.rng.uniform(-0.4, 0.4)
+            along = np.array([math.cos(angle), math.sin(angle)]) * self.rng.uniform(-0.7, 0.7) * self.side
+            self.car(centre + side + along, angle)
+
+    def car_park(self, centre: Points, angle: float) -> None:
+        """Rows of bays, some taken."""
+        length, depth = self.px(8.0, 30.0), self.px(5.0, 18.0)
+        colour = self.paving()
+        self.paint(rectangle(centre, length, depth, angle), colour, 4.0)
+        along, across = (
+            np.array([math.cos(angle), math.sin(angle)]),
+            np.array([-math.sin(angle), math.cos(angle)]),
+        )
+        bay = 2.5 / self.gsd
+        for k in range(int(length / bay)):
+            at = centre + along * ((k + 0.5) * bay - length / 2.0) + across * (depth / 2.0 - 2.5 / self.gsd)
+            if self.rng.random() < 0.8:
+                self.paint(
+                    rectangle(at + along * bay / 2.0, 0.12 / self.gsd, 5.0 / self.gsd, angle),
+                    colour * 0 + 225,
+                    3.0,
+                )
+            if self.rng.random() < 0.4:
+                self.car(at, angle + math.pi / 2.0)
+
+    def tree(self, centre: Points, radius: float) -> None:
+        """A crown with its shadow; it may hang over a roof."""
+        turns = np.linspace(0.0, math.tau, 14, endpoint=False)
+        ragged = radius * self.rng.uniform(0.7, 1.15, len(turns))
+        crown = centre + np.column_stack([np.cos(turns), np.sin(turns)]) * ragged[:, None]
+        self.shade(crown, radius * 1.5)
+        colour = np.array([52, 72, 40], dtype=np.float32) * self.rng.uniform(0.6, 1.5, 3).astype(np.float32)
+        self.paint(crown, colour, 14.0, ground_only=self.rng.random() < 0.7)
+        lit = centre - self.light.away * radius * 0.25 + (crown - centre) * 0.55
+        self.paint(lit, colour * 1.35, 14.0, ground_only=True)
+
+
+def _roof_faces(length: float, width: float, kind: str) -> list[tuple[Points, Points]]:
+    """Faces of a roof over a rectangle about the origin, and the downhill direction of each."""
+    half, w = length / 2.0, width / 2.0
+    corners = np.array([[half, w], [-half, w], [-half, -w], [half, -w]])
+    if kind == "flat":
+        return [(corners, np.zeros(2))]
+    if kind == "shed":
+        return [(corners, np.array([0.0, 1.0]))]
+    inset = min(w, half * 0.8) if kind == "hip" else 0.0
+    ridge = np.array([[half - inset, 0.0], [inset - half, 0.0]])
+    faces = [
+        (np.array([corners[0], corners[1], ridge[1], ridge[0]]), np.array([0.0, 1.0])),
+        (np.array([corners[2], corners[3], ridge[0], ridge[1]]), np.array([0.0, -1.0])),
+    ]
+    if kind == "hip":
+        faces.append((np.array([corners[3], corners[0], ridge[0]]), np.array([1.0, 0.0])))
+        faces.append((np.array([corners[1], corners[2], ridge[1]]), np.array([-1.0, 0.0])))
+    return faces
+
+
+def building(canvas: Canvas, number: int, centre: Points, length: float, width: float, angle: float) -> bool:
+    """Draw one building of one or two wings with its shadow; False where another stands."""
+    rng = canvas.rng
+    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    wings = [(centre, length, width, angle)]
+    if rng.random() < 0.35:
+        side = np.array([rng.choice((-1, 1)) * (length - width) / 2.0 * 0.95, width / 2.0])
+        wings.append(
+            (
+                centre + turn @ side,
+                width * rng.uniform(0.9, 1.6),
+                width * rng.uniform(0.5, 0.95),
+                angle + math.pi / 2,
+            )
+        )
+    masks = [_inside(canvas.labels.shape, rectangle(*wing)) for wing in wings]
+    footprint = np.logical_or.reduce(masks)
+    if not footprint.any() or (canvas.labels[footprint] > 0).mean() > 0.02:
+        return False
+    height = rng.uniform(2.5, 9.0) / canvas.gsd
+    for wing in wings:
+        canvas.shade(rectangle(*wing), height)
+    colour = ROOFS[rng.integers(len(ROOFS))] * rng.uniform(0.7, 1.25) + rng.uniform(-12, 12, 3).astype(
+        np.float32
+    )
+    kind = str(rng.choice(("gable", "hip", "flat", "shed"), p=(0.45, 0.2, 0.25, 0.1)))
+    stripes, amplitude = rng.uniform(0.25, 1.2) / canvas.gsd, rng.uniform(0.0, 0.12)
+    rows, columns = np.mgrid[: canvas.side, : canvas.side].astype(np.float32)
+    for (at, long, wide, a), mask in zip(wings, masks, strict=True):
+        t = np.array([[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]])
+        for face, downhill in _roof_faces(long, wide, kind):
+            where = _inside(canvas.labels.shape, at + face @ t.T) & mask
+            lit = 1.0 - 0.35 * float((t @ downhill) @ canvas.light.away) * (1.0 - canvas.light.shade)
+            along = columns[where] * math.cos(a) + rows[where] * math.sin(a)
+            ribs = 1.0 + amplitude * np.sin(along * (math.tau / max(stripes, 2.2)))
+            canvas.rgb[where] = colour * lit * ribs[:, None] + canvas.fine[where] * rng.uniform(1.0, 8.0)
+    canvas.labels[footprint] = number
+    for _ in range(rng.integers(0, 5)):  # chimneys, skylights, panels
+        spot = centre + turn @ (rng.uniform(-0.4, 0.4, 2) * (length, width))
+        size = (
+            (canvas.px(0.5, 1.5), canvas.px(0.5, 1.5))
+            if rng.random() < 0.7
+            else (canvas.px(2, 6), canvas.px(1.5, 3))
+        )
+        shine = rng.choice((0.4, 0.6, 1.5)) * colour if rng.random() < 0.6 else np.float32([44, 56, 84])
+        where = _inside(canvas.labels.shape, rectangle(spot, *size, angle)) & footprint
+        canvas.rgb[where] = shine
+    return True
+
+
+def annexes(canvas: Canvas, centre: Points, length: float, width: float, angle: float) -> None:
+    """Driveway, terrace, lawn or yard about a building: rectangles along its walls that are no building."""
+    rng = canvas.rng
+    along, across = (
+        np.array([math.cos(angle), math.sin(angle)]),
+        np.array([-math.sin(angle), math.cos(angle)]),
+    )
+    if rng.random() < 0.5:
+        plot = rectangle(centre, length + canvas.px(6, 20), width + canvas.px(6, 20), angle)
+        canvas.paint(plot, GROUNDS[rng.integers(len(GROUNDS))] * rng.uniform(0.8, 1.2), 8.0)
+    for _ in range(rng.integers(0, 4)):
+        long, wide = canvas.px(2.5, 14.0), canvas.px(2.5, 6.0)
+        side = float(rng.choice((-1, 1)))
+        at = centre + across * side * (width + wide) / 2.0 + along * rng.uniform(-0.5, 0.5) * length
+        if rng.random() < 0.5:
+            at = centre + along * side * (length + long) / 2.0 + across * rng.uniform(-0.5, 0.5) * width
+        canvas.paint(rectangle(at, long, wide, angle), canvas.paving(), rng.uniform(2.0, 6.0))
+        if rng.random() < 0.3:
+            canvas.car(at, angle + rng.choice((0.0, math.pi / 2.0)))
+
+
+def render(side_px: int, gsd_m: float, rng: np.random.Generator) -> tuple[Image, Labels]:
+    """A square of a town nobody knows: RGB (side, side, 3) 0-255 and labels (side, side)."""
+    canvas = Canvas(side_px, gsd_m, rng)
+    angle = rng.uniform(0.0, math.pi)
+    for _ in range(rng.integers(0, 4)):
+        canvas.paint(
+            rectangle(canvas.place(), canvas.px(8, 40), canvas.px(8, 40), angle),
+            GROUNDS[rng.integers(len(GROUNDS))] * rng.uniform(0.8, 1.2), 8.0,
+        )  # fmt: skip
+    for _ in range(rng.integers(0, 3)):
+        canvas.road(canvas.place(), angle + rng.choice((0.0, math.pi / 2.0)) + rng.normal(0.0, 0.1))
+    for _ in range(rng.integers(0, 3)):
+        canvas.car_park(canvas.place(), angle)
+    dense = rng.random() < 0.25
+    count, number = int(rng.integers(4, 26) if dense else rng.integers(0, 9)), 0
+    plans = []
+    while len(plans) < count:
+        length, width = canvas.px(5.0, 18.0), canvas.px(4.0, 11.0)
+        if rng.random() < 0.1:
+            length, width = canvas.px(18.0, 45.0), canvas.px(9.0, 22.0)
+        at, own = canvas.place(), angle + rng.choice((0.0, math.pi / 2.0)) + rng.normal(0.0, 0.12)
+        row = int(rng.integers(2, 6)) if rng.random() < (0.7 if dense else 0.1) else 1  # a terrace of houses
+        step = np.array([math.cos(own), math.sin(own)]) * length
+        plans += [(at + step * k, length, width * rng.uniform(0.85, 1.15), own) for k in range(row)]
+    for plan in plans:
+        annexes(canvas, *plan)
+    for plan in plans:
+        number += building(canvas, number + 1, *plan)
+    for _ in range(int(rng.exponential(6.0))):
+        canvas.tree(canvas.place(), canvas.px(1.0, 5.0))
+    if rng.random() < 0.2:  # a wood
+        edge = canvas.place()
+        for _ in range(40):
+            canvas.tree(edge + rng.normal(0.0, 0.18 * side_px, 2), canvas.px(1.5, 4.0))
+    return np.clip(canvas.rgb, 0.0, 255.0).astype(np.float32), canvas.labels
+
+
+def decoys(rgb: Image, labels: Labels, gsd_m: float, rng: np.random.Generator) -> Image:
+    """A real picture with pavings, car parks and cars drawn on its ground: none of them is a building."""
+    canvas = Canvas(len(rgb), gsd_m, rng)
+    canvas.rgb, canvas.labels = rgb.copy(), labels
+    angle = rng.uniform(0.0, math.pi)
+    for _ in range(rng.integers(1, 5)):
+        if rng.random() < 0.4:
+            canvas.car_park(canvas.place(), angle)
+        else:
+            canvas.paint(
+                rectangle(canvas.place(), canvas.px(3, 20), canvas.px(2.5, 10), angle),
+                canvas.paving(),
+                rng.uniform(2, 7),
+            )
+    for _ in range(rng.integers(0, 4)):
+        canvas.car(canvas.place(), angle)
+    return canvas.rgb
