@@ -283,16 +283,21 @@ def _map(args: argparse.Namespace) -> int:
     settings = load(args.config, [*_registration(args), *args.overrides])
     segmenter = Segmenter(config_of(settings, SEGMENTER, SegmenterConfig))
     mapper = Mapper(config_of(settings, MAPPER, MapperConfig))
-    update, picture = None, MapPicture()
+    update, picture, refused = None, MapPicture(), list[str]()
     for frame in _frames(args.bag):
         if isinstance(frame, FrameFault) or (mask := segmenter.process(frame)) is None:
             continue
         if args.plot is not None:
             picture.add(frame)
-        update = mapper.add(frame, mask) or update
+        try:
+            update = mapper.add(frame, mask) or update
+        except BuildlocError as error:
+            refused.append(str(error))
         if update is not None:
             _progress(f"{len(update.keyframes)} keyframes, {len(update.local_map)} buildings")
     update = mapper.finish()
+    if refused:
+        print(f"warning: {len(refused)} keyframes were refused; the first: {refused[0]}", file=sys.stderr)
     if update is None:
         raise BuildlocError(f"{args.bag}: gave no map; no keyframe could be added")
     write_map(update.outlines, update.local_map, args.out)
