@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 IMAGE_WIDTH_PX = 320  # of a keyframe, as it is kept until the end of the flight
 LONGEST_SIDE_PX = 2000
-LINKS = {"skip": "tab:cyan", "loop": "tab:red", "join": "tab:purple"}  # the path shows the consecutive ones
+LINKS = {"skip": "tab:cyan", "loop": "tab:red"}  # the path shows the consecutive ones
 
 
 @dataclass(frozen=True)

@@ -85,7 +85,7 @@ def mapped(
     update = mapper.finish()
     if update is None:
         return Path2d((), (), {}), None
-    kept = ("loop_closures", "restarts", "submaps")
+    kept = ("loop_closures", "submaps", "unlinked", "joins", "scale_sigma")
     counts = {k: v for k, v in update.funnel.items() if k in kept or k.startswith("rejected_")}
     counts["median_ms_per_keyframe"] = 1e3 * float(np.median(seconds))
     poses = tuple(Similarity(k.x_m, k.y_m, k.yaw_rad, k.scale) for k in update.keyframes)

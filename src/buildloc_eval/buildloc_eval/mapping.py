@@ -97,6 +97,7 @@ BARS = (
         )
     ),
     Bar("altitude_bias", "scale_error_percent", 0.5),
+    Bar("altitude_bias", "scale_in_sigmas", 2.0),
     Bar("endurance", "median_ms", 250.0),
     Bar("endurance", "last_over_first", 1.25),
     Bar("endurance", "peak_memory_mb", 1000.0),
@@ -218,15 +219,18 @@ def cut_scores(ground: LabelledGround, config: MapperConfig, folder: Path, seed:
 
 
 def bias_scores(ground: LabelledGround, config: MapperConfig, seed: int) -> Scores:
-    """The same flight with an altimeter that says too much: the map is as much too large."""
+    """The same flight with an altimeter that says too much: the map is as much too large, and tells a standard
+    deviation of its scale that allows for it."""
     path, update = mapped(cut_flight(ground, seed, BIAS), config)
     aligned = align(cut_flight(ground, seed), path, with_scale=True)
     if update is None or aligned is None:
         return {}
-    larger = 1.0 / aligned.scores["scale"]
+    larger, sigma = 1.0 / aligned.scores["scale"], update.funnel["scale_sigma"]
     return {
         "altitude_told_over_true": BIAS, "map_over_world": larger,
-        "scale_error_percent": 100.0 * abs(larger / BIAS - 1.0), "similarity_alignment": aligned.scores,
+        "scale_error_percent": 100.0 * abs(larger / BIAS - 1.0),
+        "scale_sigma_told": sigma, "scale_in_sigmas": abs(math.log(larger)) / sigma,
+        "similarity_alignment": aligned.scores,
     }  # fmt: skip
 
 

@@ -29,6 +29,12 @@ class Similarity(NamedTuple):
         yaw = math.remainder(self.yaw_rad + other.yaw_rad, math.tau)
         return Similarity(float(x), float(y), yaw, self.scale * other.scale)
 
+    def inverse(self) -> Similarity:
+        """What takes the target back to the source."""
+        undone = Similarity(0.0, 0.0, -self.yaw_rad, 1.0 / self.scale)
+        x, y = undone.apply(np.array([[-self.x_m, -self.y_m]]))[0]
+        return undone._replace(x_m=float(x), y_m=float(y))
+
     def matrix(self) -> FloatArray:
         """(3, 3) homogeneous matrix."""
         c, s = self.scale * math.cos(self.yaw_rad), self.scale * math.sin(self.yaw_rad)
