@@ -219,8 +219,8 @@ def cut_scores(ground: LabelledGround, config: MapperConfig, folder: Path, seed:
 
 
 def bias_scores(ground: LabelledGround, config: MapperConfig, seed: int) -> Scores:
-    """The same flight with an altimeter that says too much: the map is as much too large, and tells a standard
-    deviation of its scale that allows for it."""
+    """The same flight with an altimeter that says too much: the map is as much too large, and the standard
+    deviation that it tells of its scale allows for it."""
     path, update = mapped(cut_flight(ground, seed, BIAS), config)
     aligned = align(cut_flight(ground, seed), path, with_scale=True)
     if update is None or aligned is None:
