@@ -9,10 +9,11 @@ import os
 import sys
 from pathlib import Path
 
-from buildloc.settings import REFERENCE_DB, load
+from buildloc.settings import REFERENCE_DB, SEGMENTER, config_of, load
 from buildloc_msgs_py.config import from_mapping
 from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.types import Fix
+from buildloc_segmenter.config import SegmenterConfig
 
 from buildloc_eval.flight import FlightConfig, fly
 from buildloc_eval.sim import SimError, remove_bag, write_flight
@@ -141,10 +142,21 @@ def run_demo(args: argparse.Namespace) -> int:
 
 def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `buildloc eval`."""
-    parser.add_argument("name", choices=["barnarp", "mapping", "scale"], help="which evaluation")
+    parser.add_argument(
+        "name", choices=["barnarp", "mapping", "scale", "segmentation"], help="which evaluation"
+    )
     parser.add_argument("--out", type=Path, required=True, help="folder for report.json and report.html")
-    parser.add_argument("--seed", type=int, default=1, help="seed of the flight")
+    parser.add_argument("--seed", type=int, default=1, help="seed of everything random")
     parser.add_argument("--quick", action="store_true", help="a part of it, in less than five minutes")
+    group = parser.add_argument_group("eval segmentation")
+    group.add_argument(
+        "--case", action="append", default=[], metavar="PLACE=MODEL", dest="cases",
+        help="score an ONNX network on a place it never saw; repeatable (default: shipped one, barnarp)",
+    )  # fmt: skip
+    group.add_argument(
+        "--set", action="append", default=[], metavar="NODE.PARAMETER=VALUE", dest="overrides",
+        help="parameter of networks without their own contract, such as segmenter_node.output=probability",
+    )  # fmt: skip
 
 
 def run_eval(args: argparse.Namespace) -> int:
@@ -152,6 +164,10 @@ def run_eval(args: argparse.Namespace) -> int:
     from buildloc.supervisor import dds_environment
 
     os.environ.update(dds_environment())
+    if args.name != "segmentation" and (args.cases or args.overrides):
+        raise BuildlocError(
+            f"--case and --set are of `eval segmentation`; leave them out of `eval {args.name}`"
+        )
     if args.name == "scale":
         from buildloc_eval import scale
 
@@ -160,6 +176,12 @@ def run_eval(args: argparse.Namespace) -> int:
         from buildloc_eval import mapping
 
         print(mapping.evaluate(args.out, args.seed, args.quick, _stage))
+    elif args.name == "segmentation":
+        from buildloc_eval import segmentation
+
+        cases = [segmentation.parse_case(text) for text in args.cases] or segmentation.DEFAULT
+        config = config_of(load(None, args.overrides), SEGMENTER, SegmenterConfig)
+        print(segmentation.evaluate(args.out, args.seed, args.quick, cases, config, _stage))
     else:
         from buildloc_eval import barnarp
 

@@ -112,15 +112,17 @@ def read_inria(folder: Path) -> Iterator[tuple[str, Scene]]:
         yield scene.name.rstrip("0123456789"), scene
 
 
-def read_web_tiles(images: Path, masks: Path) -> Iterator[Scene]:
-    """Tiles of the web-mercator grid, named ...x-y-zoom, pasted together: one scene for every zoom."""
+def read_web_tiles(images: Path, masks: Path, only_zoom: int | None = None) -> Iterator[Scene]:
+    """Tiles of the web-mercator grid, named ...x-y-zoom, pasted together: one scene for every zoom, or of one
+    zoom alone."""
     tiles: dict[int, list[tuple[int, int, Path, Path]]] = {}
     for image, mask in _pairs(images, masks):
         try:
             x, y, zoom = (int(number) for number in mask.stem.split("-")[-3:])
         except ValueError as error:
             raise PlaceError(f"{mask}: a web tile is named NAME-x-y-zoom; rename it") from error
-        tiles.setdefault(zoom, []).append((x, y, image, mask))
+        if only_zoom in (None, zoom):
+            tiles.setdefault(zoom, []).append((x, y, image, mask))
     for zoom, at in sorted(tiles.items()):
         side = _read(at[0][3], cv2.IMREAD_GRAYSCALE).shape[0]
         left, top = min(t[0] for t in at), min(t[1] for t in at)
@@ -226,10 +228,10 @@ def _half(imagery: Path, west: bool) -> list[Scene]:
     return [scene.part(slice(None), columns, f"barnarp_{'west' if west else 'east'}")]
 
 
-def _tiles(imagery: Path, folder: str) -> list[Scene]:
+def _tiles(imagery: Path, folder: str, only_zoom: int | None) -> list[Scene]:
+    images, masks = imagery / folder / "images", imagery / folder / "masks"
     return [
-        replace(scene, name=f"{folder}/{scene.name}")
-        for scene in read_web_tiles(imagery / folder / "images", imagery / folder / "masks")
+        replace(scene, name=f"{folder}/{scene.name}") for scene in read_web_tiles(images, masks, only_zoom)
     ]
 
 
@@ -240,18 +242,44 @@ def _banepa_ortho(imagery: Path) -> Scene:
 
 
 # Places whose ground is apart; the halves are parts of barnarp. banepa's two sources adjoin.
-PLACES: dict[str, Callable[[Path], list[Scene]]] = {
-    "barnarp": lambda imagery: [_barnarp(imagery)],
-    "barnarp_west": lambda imagery: _half(imagery, west=True),
-    "barnarp_east": lambda imagery: _half(imagery, west=False),
-    "banepa": lambda imagery: [_banepa_ortho(imagery), *_tiles(imagery, "tiles_banepa_z")],
-    "zanzibar": lambda imagery: _tiles(imagery, "tiles_zanzibar"),
-    "philippines": lambda imagery: _tiles(imagery, "tiles_philippines"),
+PLACES: dict[str, Callable[[Path, int | None], list[Scene]]] = {
+    "barnarp": lambda imagery, _: [_barnarp(imagery)],
+    "barnarp_west": lambda imagery, _: _half(imagery, west=True),
+    "barnarp_east": lambda imagery, _: _half(imagery, west=False),
+    "banepa": lambda imagery, zoom: [_banepa_ortho(imagery), *_tiles(imagery, "tiles_banepa_z", zoom)],
+    "zanzibar": lambda imagery, zoom: _tiles(imagery, "tiles_zanzibar", zoom),
+    "philippines": lambda imagery, zoom: _tiles(imagery, "tiles_philippines", zoom),
 }
+PARTS = {"barnarp": ("barnarp_west", "barnarp_east")}  # places that are made of others
 
 
-def place(imagery: Path, name: str) -> list[Scene]:
-    """Every labelled scene of a place, at its own ground sampling distance; zooms of one ground repeat it."""
+def overlap(one: str, other: str) -> bool:
+    """Whether two places share ground."""
+    return not set(PARTS.get(one, (one,))).isdisjoint(PARTS.get(other, (other,)))
+
+
+def place(imagery: Path, name: str, only_zoom: int | None = None) -> list[Scene]:
+    """Every labelled scene of a place, at its own ground sampling distance.
+
+    Zooms of web tiles repeat the same ground: ``only_zoom`` leaves one of them. Raises PlaceError.
+    """
     if name not in PLACES:
         raise PlaceError(f"{name}: is no place of the data; they are {', '.join(PLACES)}")
-    return PLACES[name](imagery)
+    return PLACES[name](imagery, only_zoom)
+
+
+def patches(scene: Scene) -> list[Scene]:
+    """The connected parts of a scene's labelled ground, each cut out; parts beside it are unlabelled."""
+    count, part, stats, _ = cv2.connectedComponentsWithStats(scene.labelled.astype(np.uint8), connectivity=8)
+    found = []
+    for number in range(1, count):
+        left, top, width, height = stats[number, :4]
+        window = np.s_[top : top + height, left : left + width]
+        labelled = part[window] == number
+        found.append(
+            Scene(
+                f"{scene.name}#{number}" if count > 2 else scene.name, scene.gsd_m, scene.rgb[window],
+                np.where(labelled, scene.buildings[window], 0).astype(np.int32), labelled,
+            )
+        )  # fmt: skip
+    return found

@@ -129,7 +129,7 @@ def test_memory_follows_the_area() -> None:
 @given(st.integers(0, 10**6))
 def test_incremental_is_what_fusing_from_scratch_gives(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    flight = Flight()
+    flight = Flight(replace(CONFIG, map_gsd_m=0.5))
     for pose in LINE:
         flight.fly(TOWN, pose)
         for keyframe, now in list(flight.poses.items()):
@@ -140,7 +140,7 @@ def test_incremental_is_what_fusing_from_scratch_gives(seed: int) -> None:
             del flight.poses[int(rng.choice(list(flight.poses)))]
         grown = flight.update()
     drawn = {keyframe: drawn.pose for keyframe, drawn in flight.fusion.drawn.items()}
-    scratch = Flight()
+    scratch = Flight(flight.config)
     scratch.views, scratch.poses = flight.views, drawn
     same_map(grown, scratch.update())
     same_counts(flight.fusion, scratch.fusion)

@@ -61,6 +61,7 @@ class Network:
 
     Construction loads the file and runs it once on noise. Raises NetworkError, or ConfigError. ``provider``
     is the ONNX Runtime provider that runs it; one that was asked for and does not run is logged.
+    ``metadata``: what the file says of itself.
     """
 
     def __init__(self, config: SegmenterConfig) -> None:
@@ -71,7 +72,8 @@ class Network:
         )
         self._session = _load(self._path, config)
         self.provider: str = self._session.get_providers()[0]
-        own = self._session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
+        self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
+        own = self.metadata.get(METADATA_KEY)
         self._carries_contract = own is not None
         if own is not None:
             try:

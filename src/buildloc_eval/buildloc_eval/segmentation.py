@@ -1,0 +1,237 @@
+"""`buildloc eval segmentation`: networks on labelled real ground they never saw, building by building."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from buildloc_msgs_py.errors import BuildlocError
+from buildloc_segmenter.config import SegmenterConfig
+from buildloc_segmenter.network import Network
+
+from buildloc_eval.html import write_report
+from buildloc_eval.instance_metrics import (
+    HALF,
+    LEAST_IOU,
+    MIN_AREA_M2,
+    STRICT_IOU,
+    Comparison,
+    figures,
+    pooled,
+)
+from buildloc_eval.machine import machine
+from buildloc_eval.overlays import draw_windows, largest
+from buildloc_eval.places import Scene, overlap, patches, place
+from buildloc_eval.realworld import data_folder
+from buildloc_eval.segmented import SCORED_GSD_M, Scored, busiest, disturbed, score
+
+Progress = Callable[[str], None]
+
+TRAINING_KEY = "buildloc_training"  # of the ONNX file's metadata: JSON with the places that trained it
+ONE_ZOOM = 20  # of web tiles: the zooms of a place show the same ground
+DISTURBED_SIDE_M = 350.0
+QUICK_SIDE_M = 250.0
+REAL = "imagery: real (orthophotos and drone imagery, outlines drawn by people); nothing is simulated"
+RULES = {
+    "raster": f"{SCORED_GSD_M:g} m per pixel",
+    "matched": f"one to one, best IoU first, at IoU {STRICT_IOU:g} and {LEAST_IOU:g}",
+    "merged": f"one found building covers at least {HALF:g} of this true one and of another",
+    "split": f"at least {HALF:g} of each of several found buildings lies in this true one",
+    "missed, false": f"neither matched at IoU {LEAST_IOU:g} nor merged nor split",
+    "not counted": f"below {MIN_AREA_M2:g} m2, cut by the edge of the labelled ground, found on such a one",
+    "plain": "connected components of the same pixels, without separation of instances",
+    "wire": "connected components of the mask that the mapper receives",
+}
+
+
+class EvaluationError(BuildlocError):
+    """Something cannot be evaluated as asked."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A network and the place that it is scored on. ``model`` empty: the one that is shipped."""
+
+    place: str
+    model: str
+
+
+def parse_case(text: str) -> Case:
+    """PLACE=MODEL. Raises EvaluationError."""
+    name, equals, model = text.partition("=")
+    if not (name and equals):
+        raise EvaluationError(f"--case {text}: expected PLACE=MODEL, such as barnarp=network.onnx")
+    return Case(name, model)
+
+
+DEFAULT = (Case("barnarp", ""),)  # the only place that never trains what is shipped
+
+
+def trained_on(network: Network) -> dict[str, Any] | None:
+    """How a network was trained, as its own file says; None when it does not."""
+    text = network.metadata.get(TRAINING_KEY)
+    return None if text is None else dict(json.loads(text))
+
+
+def refuse_known_ground(case: Case, training: dict[str, Any] | None) -> None:
+    """Raise EvaluationError when a network was trained on the ground that it is to be scored on."""
+    known = [name for name in (training or {}).get("places", []) if overlap(name, case.place)]
+    if known:
+        raise EvaluationError(
+            f"{case.model or 'the shipped network'}: was trained on {', '.join(known)}, so {case.place} says "
+            "nothing of ground it has never seen; score it on another place"
+        )
+
+
+def failures(scored: Scored) -> dict[str, list[dict[str, Any]]]:
+    """The largest missed and false buildings: area, and place in the scene's pixels."""
+    return {
+        name: [
+            {
+                "area_m2": round(float(side.area_m2[k]), 1),
+                "pixel": [round(v / SCORED_GSD_M) for v in side.centroid_m[k].tolist()],
+            }
+            for k in largest(side)
+        ]
+        for name, side in (("missed", scored.instances.true), ("false", scored.instances.found))
+    }
+
+
+def scores_of(parts: Sequence[Scored]) -> dict[str, dict[str, float | None]]:
+    """Figures of the segmenter's instances, of plain components, and of the mask on the wire."""
+    return {
+        name: figures(pooled([getattr(part, name) for part in parts]))
+        for name in ("instances", "plain", "wire")
+    }
+
+
+def robustness(network: Network, scene: Scene, progress: Progress) -> dict[str, Any]:
+    """IoU of each disturbance on the busiest square of a scene, and how far it falls from that of the
+    picture as it comes."""
+    square = busiest(scene, DISTURBED_SIDE_M)
+    before = figures(score(network, square).instances)["pixel_iou"] or 0.0
+    rows: dict[str, Any] = {"as it comes": {"pixel_iou": before}}
+    for kind, result in disturbed(network, square):
+        progress(f"{scene.name}: {kind.name}")
+        found = figures(result)
+        iou = found["pixel_iou"] or 0.0
+        rows[kind.name] = {
+            "pixel_iou": iou, "falls_by": before - iou,
+            "recall_0.3": found["recall_0.3"], "precision_0.3": found["precision_0.3"],
+        }  # fmt: skip
+    return rows
+
+
+@dataclass(frozen=True)
+class CaseResult:
+    """What goes into the report, the pictures, and the comparison of the segmenter's instances."""
+
+    report: dict[str, Any]
+    pictures: list[tuple[str, Path]]
+    comparison: Comparison
+
+
+def run_case(
+    case: Case, config: SegmenterConfig, imagery: Path, out: Path, seed: int, quick: bool, progress: Progress
+) -> CaseResult:
+    """Score a network on a place. Raises EvaluationError, PlaceError, NetworkError."""
+    network = Network(replace(config, model=case.model))
+    training = trained_on(network)
+    refuse_known_ground(case, training)
+    scenes: dict[str, Any] = {}
+    pictures, everything = [], []
+    widest: Scene | None = None
+    for scene in place(imagery, case.place, ONE_ZOOM):
+        progress(f"{case.place}: {scene.name}")
+        parts = []
+        for patch in patches(scene):
+            part = busiest(patch, QUICK_SIDE_M) if quick else patch
+            parts.append(score(network, part))
+            widest = part if widest is None or part.labelled.sum() > widest.labelled.sum() else widest
+        main = max(parts, key=lambda part: len(part.instances.true))
+        name = f"{case.place}_{scene.name.replace('/', '_')}"
+        picture = out / f"{name}_{Path(case.model).stem or 'shipped'}.png"
+        draw_windows(picture, main, seed)
+        pictures.append((f"{case.place}, {scene.name}: true outlines green, found ones magenta", picture))
+        scenes[scene.name] = scores_of(parts) | {"largest failures": failures(main)}
+        everything += parts
+    assert widest is not None  # no place is empty
+    report = {
+        "place": case.place,
+        "model": case.model or "shipped",
+        "trained on": training or "the file does not say: make sure that it is other ground than this place",
+        "all scenes": scores_of(everything),
+        "scenes": scenes,
+        "disturbed input": robustness(network, widest, progress),
+    }
+    return CaseResult(report, pictures, pooled([part.instances for part in everything]))
+
+
+def evaluate(
+    out: Path,
+    seed: int,
+    quick: bool,
+    cases: Sequence[Case],
+    config: SegmenterConfig,
+    progress: Progress,
+) -> str:
+    """Score every case, write report.json and report.html; the summary.
+
+    Raises EvaluationError, PlaceError, NetworkError.
+    """
+    imagery = data_folder() / "imagery"
+    out.mkdir(parents=True, exist_ok=True)
+    results = [run_case(case, config, imagery, out, seed, quick, progress) for case in cases]
+    report = {
+        "evaluation": "segmentation",
+        "what is real": REAL,
+        "what trained": {
+            f"{r.report['model']} on {r.report['place']}": r.report["trained on"] for r in results
+        },
+        "command": " ".join(["buildloc", *sys.argv[1:]]),
+        "seed": seed,
+        "quick": quick,
+        "how it is counted": RULES,
+        **machine(),
+        "cases": {f"{r.report['place']}, {r.report['model']}": r.report for r in results},
+    }
+    (out / "report.json").write_text(json.dumps(report, indent=2) + "\n")
+    pictures = [picture for result in results for picture in result.pictures]
+    write_report(out / "report.html", "Segmentation of ground never seen", report, pictures)
+    return table([r.report for r in results])
+
+
+COLUMNS = (
+    ("pixel_iou", "IoU"), ("pixel_f1", "F1"), ("recall_0.5", "R.5"), ("precision_0.5", "P.5"),
+    ("recall_0.3", "R.3"), ("precision_0.3", "P.3"), ("merged", "merged"), ("split", "split"),
+    ("missed", "missed"), ("centroid_median_m", "c50_m"), ("centroid_p90_m", "c90_m"),
+    ("outline_m", "line_m"), ("false_per_km2", "f/km2"),
+)  # fmt: skip
+
+
+def table(reports: Sequence[dict[str, Any]]) -> str:
+    """For people: a row for each scene and way of counting, then the disturbances."""
+    head = " ".join(f"{title:>6}" for _, title in COLUMNS)
+    lines = [REAL, "", f"{'place, scene':<28} {'':<9} {head}"]
+
+    def row(name: str, kind: str, values: dict[str, Any]) -> str:
+        cells = " ".join(
+            f"{'-':>6}" if values[key] is None else f"{values[key]:6.{0 if key == 'false_per_km2' else 3}f}"
+            for key, _ in COLUMNS
+        )
+        return f"{name:<28} {kind:<9} {cells}"
+
+    for report in reports:
+        lines.append(f"{report['model']}, trained on: {json.dumps(report['trained on'])}")
+        groups = report["scenes"] | ({"all": report["all scenes"]} if len(report["scenes"]) > 1 else {})
+        for scene, values in groups.items():
+            name = f"{report['place']}, {scene}" if scene != report["place"] else scene
+            lines += [row(name, kind, values[kind]) for kind in ("instances", "plain", "wire")]
+        for kind, values in report["disturbed input"].items():
+            fall = "" if "falls_by" not in values else f", falls by {values['falls_by']:.3f}"
+            lines.append(f"  {kind}: IoU {values['pixel_iou']:.3f}{fall}")
+    return "\n".join(lines)
