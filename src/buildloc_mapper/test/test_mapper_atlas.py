@@ -125,7 +125,7 @@ def test_an_altimeter_that_is_off_by_3_percent_scales_the_map_and_the_sigma_says
     atlas, _ = flown(frames)
     length = float(np.linalg.norm(places(atlas, [0, 4])[1])) / math.dist(path[0], path[4])
     assert length == pytest.approx(1.03, abs=0.003)
-    assert abs(length - 1.0) < 2.0 * atlas.submap(4).sigmas(4)[1]
+    assert abs(length - 1.0) < 2.0 * atlas.submap(4).scale_sigma(4)
     assert atlas.submap(4).poses[4].scale == pytest.approx(1.0, abs=0.003)
 
 
