@@ -171,11 +171,9 @@ def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
         help="parameter of networks without their own contract, such as segmenter_node.output=probability",
     )  # fmt: skip
     group.add_argument(
-        "--speed",
-        nargs="+",
-        metavar="MODEL",
-        help="networks to time beside each other (default: the shipped one)",
-    )
+        "--speed", nargs="*", metavar="MODEL",
+        help="time networks beside each other (none named: the shipped one)",
+    )  # fmt: skip
     group.add_argument(
         "--write-errors", type=Path, metavar="FILE", help="measure the error model, write it here"
     )
@@ -186,7 +184,9 @@ def run_eval(args: argparse.Namespace) -> int:
     from buildloc.supervisor import dds_environment
 
     os.environ.update(dds_environment())
-    if args.name != "segmentation" and (args.cases or args.overrides or args.speed or args.write_errors):
+    if args.name != "segmentation" and (
+        args.cases or args.overrides or args.speed is not None or args.write_errors
+    ):
         raise BuildlocError(
             f"--case, --set, --speed and --write-errors are of `eval segmentation`, not of `eval {args.name}`"
         )
@@ -206,9 +206,8 @@ def run_eval(args: argparse.Namespace) -> int:
 
         cases = tuple(segmentation.parse_case(text) for text in args.cases) or segmentation.DEFAULT
         config = config_of(load(None, args.overrides), SEGMENTER, SegmenterConfig)
-        plan = segmentation.Plan(
-            cases, config, args.seed, args.quick, tuple(args.speed or [""]), args.write_errors
-        )
+        speed = () if args.speed is None else tuple(args.speed) or ("",)
+        plan = segmentation.Plan(cases, config, args.seed, args.quick, speed, args.write_errors)
         print(segmentation.evaluate(args.out, plan, _stage))
     else:
         from buildloc_eval import barnarp

@@ -16,7 +16,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from buildloc_msgs_py.types import ByteArray
 from buildloc_segmenter.config import SegmenterConfig
 from buildloc_segmenter.instances import draw_mask, find_instances
 from buildloc_segmenter.network import Network
