@@ -8,6 +8,7 @@ import math
 import os
 import sys
 from pathlib import Path
+from typing import Literal
 
 from buildloc.settings import REFERENCE_DB, SEGMENTER, config_of, load
 from buildloc_msgs_py.config import from_mapping
@@ -42,6 +43,14 @@ def _extent(text: str) -> float:
     if not 300.0 <= extent <= 20_000.0:
         raise argparse.ArgumentTypeError(f"{text!r} is not a length of 300 to 20000 m")
     return extent
+
+
+def _level(text: str) -> int | Literal["measured"]:
+    if text == "measured":
+        return "measured"
+    if not (text.isdecimal() and 1 <= int(text) <= 8):
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a whole number from 1 to 8 nor measured")
+    return int(text)
 
 
 def _progress(done: int, total: int) -> None:
@@ -148,6 +157,10 @@ def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder for report.json and report.html")
     parser.add_argument("--seed", type=int, default=1, help="seed of everything random")
     parser.add_argument("--quick", action="store_true", help="a part of it, in less than five minutes")
+    parser.add_argument_group("eval scale").add_argument(
+        "--levels", nargs="+", type=_level, metavar="LEVEL",
+        help="levels of the maps' errors: numbers, or `measured` on the segmenter (default: 1 2 3)",
+    )  # fmt: skip
     group = parser.add_argument_group("eval segmentation")
     group.add_argument(
         "--case", action="append", default=[], metavar="PLACE=MODEL", dest="cases",
@@ -157,6 +170,13 @@ def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
         "--set", action="append", default=[], metavar="NODE.PARAMETER=VALUE", dest="overrides",
         help="parameter of networks without their own contract, such as segmenter_node.output=probability",
     )  # fmt: skip
+    group.add_argument(
+        "--speed", nargs="*", metavar="MODEL",
+        help="time networks beside each other (none named: the shipped one)",
+    )  # fmt: skip
+    group.add_argument(
+        "--write-errors", type=Path, metavar="FILE", help="measure the error model, write it here"
+    )
 
 
 def run_eval(args: argparse.Namespace) -> int:
@@ -164,14 +184,19 @@ def run_eval(args: argparse.Namespace) -> int:
     from buildloc.supervisor import dds_environment
 
     os.environ.update(dds_environment())
-    if args.name != "segmentation" and (args.cases or args.overrides):
+    if args.name != "segmentation" and (
+        args.cases or args.overrides or args.speed is not None or args.write_errors
+    ):
         raise BuildlocError(
-            f"--case and --set are of `eval segmentation`; leave them out of `eval {args.name}`"
+            f"--case, --set, --speed and --write-errors are of `eval segmentation`, not of `eval {args.name}`"
         )
+    if args.name != "scale" and args.levels:
+        raise BuildlocError(f"--levels is of `eval scale`, not of `eval {args.name}`")
     if args.name == "scale":
         from buildloc_eval import scale
 
-        print(scale.evaluate(args.out, args.seed, args.quick, _stage))
+        levels = None if args.levels is None else tuple(args.levels)
+        print(scale.evaluate(args.out, args.seed, args.quick, _stage, levels))
     elif args.name == "mapping":
         from buildloc_eval import mapping
 
@@ -179,9 +204,11 @@ def run_eval(args: argparse.Namespace) -> int:
     elif args.name == "segmentation":
         from buildloc_eval import segmentation
 
-        cases = [segmentation.parse_case(text) for text in args.cases] or segmentation.DEFAULT
+        cases = tuple(segmentation.parse_case(text) for text in args.cases) or segmentation.DEFAULT
         config = config_of(load(None, args.overrides), SEGMENTER, SegmenterConfig)
-        print(segmentation.evaluate(args.out, args.seed, args.quick, cases, config, _stage))
+        speed = () if args.speed is None else tuple(args.speed) or ("",)
+        plan = segmentation.Plan(cases, config, args.seed, args.quick, speed, args.write_errors)
+        print(segmentation.evaluate(args.out, plan, _stage))
     else:
         from buildloc_eval import barnarp
 
