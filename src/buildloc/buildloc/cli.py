@@ -276,21 +276,28 @@ def _map(args: argparse.Namespace) -> int:
     from buildloc_segmenter.config import SegmenterConfig
     from buildloc_segmenter.segmenter import Segmenter
 
+    from buildloc.map_picture import MapPicture
     from buildloc.mapfile import write_map, write_tum
     from buildloc.settings import MAPPER, SEGMENTER, config_of, load
 
     settings = load(args.config, [*_registration(args), *args.overrides])
     segmenter = Segmenter(config_of(settings, SEGMENTER, SegmenterConfig))
     mapper = Mapper(config_of(settings, MAPPER, MapperConfig))
-    update = None
+    update, picture, refused = None, MapPicture(), list[str]()
     for frame in _frames(args.bag):
-        if isinstance(frame, FrameFault):
+        if isinstance(frame, FrameFault) or (mask := segmenter.process(frame)) is None:
             continue
-        mask = segmenter.process(frame)
-        update = (mapper.add(frame, mask) if mask is not None else None) or update
+        if args.plot is not None:
+            picture.add(frame)
+        try:
+            update = mapper.add(frame, mask) or update
+        except BuildlocError as error:
+            refused.append(str(error))
         if update is not None:
             _progress(f"{len(update.keyframes)} keyframes, {len(update.local_map)} buildings")
     update = mapper.finish()
+    if refused:
+        print(f"warning: {len(refused)} keyframes were refused; the first: {refused[0]}", file=sys.stderr)
     if update is None:
         raise BuildlocError(f"{args.bag}: gave no map; no keyframe could be added")
     write_map(update.outlines, update.local_map, args.out)
@@ -298,6 +305,10 @@ def _map(args: argparse.Namespace) -> int:
     if args.trajectory is not None:
         write_tum(update.keyframes, args.trajectory)
         print(f"{args.trajectory}: {len(update.keyframes)} poses (TUM)")
+    if args.plot is not None:
+        drawn = args.out.with_suffix(".png") if args.plot is True else args.plot
+        picture.write(update, drawn, str(args.bag))
+        print(f"{drawn}: mosaic of {len(update.keyframes)} images, path, buildings, links")
     return 0
 
 
@@ -468,6 +479,10 @@ def parser() -> argparse.ArgumentParser:
             commands, "map", "map file and trajectory of a bag", _map, bag,
             _argument("--out", type=Path, required=True, help="GeoJSON or GeoParquet, local metres"),
             _argument("--trajectory", type=Path, help="keyframe poses in TUM format"),
+            _argument(
+                "--plot", type=Path, nargs="?", const=True, metavar="FILE",
+                help="picture of the map (default: beside --out, .png)",
+            ),
             _argument("--registration", metavar="NAME", help="sift, xfeat, coarse_loftr or loftr"),
             _argument("--registration-model", type=Path, help="ONNX file of its weights; none for sift"),
         ),

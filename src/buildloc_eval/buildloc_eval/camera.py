@@ -40,15 +40,10 @@ def level_to_world(x_m: float, y_m: float, yaw_rad: float) -> FloatArray:
     return np.array([[c, -s, x_m], [s, c, y_m], [0.0, 0.0, 1.0]])
 
 
-def photograph(
-    world: World,
-    camera: CameraModel,
-    pose: tuple[float, float, float, float],
-    attitude_xyzw: Quaternion,
-    config: FlightConfig,
-    rng: np.random.Generator,
+def look(
+    world: World, camera: CameraModel, pose: tuple[float, float, float, float], attitude_xyzw: Quaternion
 ) -> ByteArray:
-    """(H, W, 3) BGR from ``pose`` (x, y, altitude in metres, ENU yaw of image-right).
+    """The world as it is, (H, W) or (H, W, 3), from ``pose``: x, y, altitude in m, ENU yaw of image-right.
 
     Raises WorldError when the image would reach beyond the bounds of the world.
     """
@@ -74,10 +69,23 @@ def photograph(
     rays = camera_matrix(camera) @ level_matrix(attitude_xyzw).T @ np.diag([1.0, -1.0, altitude])
     homography = to_window @ level_to_world(0.0, 0.0, yaw) @ np.linalg.inv(rays)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    image = cv2.warpPerspective(window.image_bgr, homography, (camera.width, camera.height), flags=flags)
+    seen = cv2.warpPerspective(window.image_bgr, homography, (camera.width, camera.height), flags=flags)
+    return np.asarray(seen, dtype=np.uint8)
+
+
+def photograph(
+    world: World,
+    camera: CameraModel,
+    pose: tuple[float, float, float, float],
+    attitude_xyzw: Quaternion,
+    config: FlightConfig,
+    rng: np.random.Generator,
+) -> ByteArray:
+    """What :func:`look` sees, (H, W, 3) BGR, with the blur, exposure and noise of a camera."""
+    image = look(world, camera, pose, attitude_xyzw)
     sigma = rng.uniform(0.0, config.blur_px)
     if sigma > 0.1:
-        image = cv2.GaussianBlur(image, (0, 0), sigma)
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), dtype=np.uint8)
     gain = max(0.2, 1.0 + config.exposure * rng.normal())
     grainy = image.astype(np.float32) * np.float32(gain)
     grainy += rng.standard_normal(image.shape, dtype=np.float32) * np.float32(config.noise)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from buildloc_msgs_py.config import check
@@ -14,6 +15,7 @@ from buildloc_mapper.atlas import Atlas
 from buildloc_mapper.config import MapperConfig
 from buildloc_mapper.extraction import Extractor, LocalOutlines
 from buildloc_mapper.fusion import Fusion, View
+from buildloc_mapper.pose_graph import PoseGraph
 from buildloc_mapper.similarity import Similarity, compose_covariance
 from buildloc_mapper.tracking import Lost, Tracked, Tracker
 
@@ -26,13 +28,16 @@ class MapperError(BuildlocError):
 class MapUpdate:
     """The optimised keyframes of one submap, its buildings with their outlines, and the funnel.
 
-    ``scale_sigma`` in the funnel is the relative standard deviation of the map's scale.
+    ``scale_sigma`` in the funnel is the relative standard deviation of the map's scale. ``links``: the
+    earlier and the later keyframe, by their place in ``keyframes``, and what links them: ``consecutive``,
+    ``skip`` or ``loop``.
     """
 
     keyframes: tuple[Keyframe, ...]
     local_map: LocalMap
     outlines: LocalOutlines
     funnel: dict[str, float]
+    links: tuple[tuple[int, int, str], ...]
 
 
 class Mapper:
@@ -126,4 +131,14 @@ class Mapper:
             **dict(sorted(self._atlas.counts.items())),
             "seconds": time.perf_counter() - started,
         }
-        return MapUpdate(keyframes, found.local_map, found.outlines, funnel)
+        return MapUpdate(keyframes, found.local_map, found.outlines, funnel, tuple(_links(graph)))
+
+
+def _links(graph: PoseGraph) -> Iterator[tuple[int, int, str]]:
+    """The edges of a graph as MapUpdate tells them: a keyframe's first one is that to its predecessor."""
+    place = {keyframe: i for i, keyframe in enumerate(graph.poses)}
+    linked: set[int] = set()
+    for edge in graph.edges:
+        kind = "loop" if edge.loop else "skip" if edge.later in linked else "consecutive"
+        yield place[edge.earlier], place[edge.later], kind
+        linked.add(edge.later)
