@@ -76,12 +76,9 @@ class Atlas:
         """Every submap once, the oldest first."""
         return list({id(graph): graph for graph in self._submaps}.values())
 
-    def add(self, frame: Frame) -> int | None:
-        """Link a frame later than all before; its id, or None when it shows nothing to link by."""
+    def add(self, frame: Frame) -> int:
+        """Link a frame later than all before; its id. It stays a submap of its own until something links."""
         prepared = self._registration.prepare(frame)
-        if len(prepared.corners_uv) < self._config.min_inliers:
-            self.counts["rejected_featureless"] += 1
-            return None
         keyframe = len(self._keyframes)
         self._keyframes.append(_Keyframe(frame.stamp_ns, prepared))
         first = self._latest_link(keyframe, prepared)

@@ -82,8 +82,6 @@ class Mapper:
         view = View.of(frame, mask, self.config)
         self._latest_stamp_ns = frame.stamp_ns
         keyframe = self._atlas.add(frame)
-        if keyframe is None:
-            return None
         self._views[keyframe] = view
         if keyframe > 0 and len(self._atlas.submap(keyframe).poses) == 1:
             return None

@@ -22,14 +22,13 @@ NOWHERE = Similarity(0.0, 0.0, 0.0, 1.0)
 @dataclass(frozen=True)
 class Tracked:
     """Pose of a frame in a keyframe, its (4, 4) covariance over x, y, yaw and log scale, and the corners
-    that agree. ``altitude_m`` is the frame's, which ``T_keyframe_frame`` scales."""
+    that agree."""
 
     stamp_ns: int
     keyframe: int
     T_keyframe_frame: Similarity
     covariance: FloatArray
     inliers: int
-    altitude_m: float
 
 
 @dataclass(frozen=True)
@@ -101,9 +100,7 @@ class Tracker:
             return Lost(frame.stamp_ns, link.reason)
         self._moved(frame.stamp_ns, link.transform)
         covariance = link_covariance(link, self._config)
-        return Tracked(
-            frame.stamp_ns, self._keyframe, link.transform, covariance, link.inliers, frame.altitude_m
-        )
+        return Tracked(frame.stamp_ns, self._keyframe, link.transform, covariance, link.inliers)
 
     def _follow(self, prepared: Prepared, frame: Frame) -> Link | Rejection:
         assert self._frame is not None
