@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from buildloc_mapper.appearance import Appearance
 from buildloc_mapper.config import MapperConfig
 from buildloc_mapper.pose_graph import Edge, PoseGraph, Turn
-from buildloc_mapper.registration import Link, Packed, Prepared, Registration, Rejection
+from buildloc_mapper.registration import Link, Packed, Prepared, Registration, Rejection, link_covariance
 from buildloc_mapper.similarity import Similarity
 
 ORIGIN = Similarity(0.0, 0.0, 0.0, 1.0)
@@ -64,9 +64,6 @@ class Atlas:
         self._appearance = Appearance()
         self._doubted: list[Edge] = []
 
-    def __len__(self) -> int:
-        return len(self._keyframes)
-
     def submap(self, keyframe: int) -> PoseGraph:
         """The submap that a keyframe belongs to."""
         return self._submaps[keyframe]
@@ -75,20 +72,13 @@ class Atlas:
         """Capture time of a keyframe."""
         return self._keyframes[keyframe].stamp_ns
 
-    def prepared(self, keyframe: int) -> Prepared:
-        """A keyframe as registration takes it."""
-        return self._keyframes[keyframe].unpacked()
-
     def submaps(self) -> list[PoseGraph]:
         """Every submap once, the oldest first."""
         return list({id(graph): graph for graph in self._submaps}.values())
 
-    def add(self, frame: Frame) -> int | None:
-        """Link a frame later than all before; its id, or None when it shows nothing to link by."""
+    def add(self, frame: Frame) -> int:
+        """Link a frame later than all before; its id. It stays a submap of its own until something links."""
         prepared = self._registration.prepare(frame)
-        if len(prepared.corners_uv) < self._config.min_inliers:
-            self.counts["rejected_featureless"] += 1
-            return None
         keyframe = len(self._keyframes)
         self._keyframes.append(_Keyframe(frame.stamp_ns, prepared))
         first = self._latest_link(keyframe, prepared)
@@ -120,9 +110,8 @@ class Atlas:
 
     def _edge(self, link: Link | Rejection, earlier: int, keyframe: int, kind: str) -> Edge | None:
         if isinstance(link, Link):
-            return Edge(
-                earlier, keyframe, link.transform, link.inliers, link.covariance, loop=kind == "loop_"
-            )
+            covariance = link_covariance(link, self._config)
+            return Edge(earlier, keyframe, link.transform, link.inliers, covariance, loop=kind == "loop_")
         self.counts[f"rejected_{kind}{link.reason}"] += 1
         return None
 
@@ -190,7 +179,7 @@ class Atlas:
         here = graph.poses[keyframe]
         places = np.array([graph.poses[int(i)][:2] for i in ids])
         distances = np.linalg.norm(places - here[:2], axis=1)
-        reach = self._config.loop_radius_m + SIGMAS * graph.sigmas(keyframe)[0]
+        reach = self._config.loop_radius_m + SIGMAS * graph.place_sigma_m(keyframe)
         order = np.argsort(distances, kind="stable")
         near: NDArray[np.int64] = ids[order[distances[order] <= reach]]
         return near
@@ -221,7 +210,7 @@ class Atlas:
         if graph is not self._submaps[edge.earlier]:
             return False
         told, here = graph.poses[edge.earlier].compose(edge.transform), graph.poses[edge.later]
-        sigma = math.hypot(graph.sigmas(edge.later)[0], self._config.sigma_position_m)
+        sigma = math.hypot(graph.place_sigma_m(edge.later), self._config.sigma_position_m)
         return math.dist(told[:2], here[:2]) <= SIGMAS * sigma
 
     def _correction(self, edge: Edge) -> Similarity:

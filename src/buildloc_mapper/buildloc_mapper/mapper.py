@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from buildloc_msgs_py.config import check
 from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.ground import validate_frame
-from buildloc_msgs_py.types import Frame, Keyframe, LocalMap, Mask
+from buildloc_msgs_py.types import FloatArray, Frame, Keyframe, LocalMap, Mask
 
 from buildloc_mapper.atlas import Atlas
 from buildloc_mapper.config import MapperConfig
 from buildloc_mapper.extraction import Extractor, LocalOutlines
 from buildloc_mapper.fusion import Fusion, View
+from buildloc_mapper.pose_graph import PoseGraph
+from buildloc_mapper.similarity import Similarity, compose_covariance
+from buildloc_mapper.tracking import Lost, Tracked, Tracker
 
 
 class MapperError(BuildlocError):
@@ -24,13 +28,16 @@ class MapperError(BuildlocError):
 class MapUpdate:
     """The optimised keyframes of one submap, its buildings with their outlines, and the funnel.
 
-    ``scale_sigma`` in the funnel is the relative standard deviation of the map's scale.
+    ``scale_sigma`` in the funnel is the relative standard deviation of the map's scale. ``links``: the
+    earlier and the later keyframe, by their place in ``keyframes``, and what links them: ``consecutive``,
+    ``skip`` or ``loop``.
     """
 
     keyframes: tuple[Keyframe, ...]
     local_map: LocalMap
     outlines: LocalOutlines
     funnel: dict[str, float]
+    links: tuple[tuple[int, int, str], ...]
 
 
 class Mapper:
@@ -41,11 +48,13 @@ class Mapper:
         check(config)
         self.config = config
         self._atlas = Atlas(config)
+        self._tracker = Tracker(config)
         self.reset()
 
     def reset(self) -> None:
         """Forget the flight."""
         self._atlas.reset()
+        self._tracker.reset()
         self._views: dict[int, View] = {}
         self._fusion, self._extractor = Fusion(self.config), Extractor(self.config)
         self._latest: int | None = None  # keyframe of a map
@@ -73,13 +82,28 @@ class Mapper:
         view = View.of(frame, mask, self.config)
         self._latest_stamp_ns = frame.stamp_ns
         keyframe = self._atlas.add(frame)
-        if keyframe is None:
-            return None
         self._views[keyframe] = view
         if keyframe > 0 and len(self._atlas.submap(keyframe).poses) == 1:
             return None
-        self._latest = keyframe
+        graph, before, self._latest = self._atlas.submap(keyframe), self._latest, keyframe
+        T_new_old = None  # noqa: N806
+        if before is not None and before in graph.poses:
+            T_new_old = graph.poses[keyframe].inverse().compose(graph.poses[before])  # noqa: N806
+        self._tracker.rebase(keyframe, frame, T_new_old)
         return self._update(keyframe, started)
+
+    def track(self, frame: Frame) -> Tracked | Lost:
+        """Where a frame between keyframes is, in the latest keyframe of the map. Raises WireError for
+        unusable telemetry."""
+        return self._tracker.track(frame)
+
+    def on_map(self, tracked: Tracked) -> tuple[Similarity, FloatArray]:
+        """A tracked pose in ``buildloc_map``, and its (4, 4) covariance over x, y, yaw and log scale as seen
+        from the map's first keyframe, the altimeter's bias left out."""
+        graph = self._atlas.submap(tracked.keyframe)
+        pose, covariance = graph.poses[tracked.keyframe], graph.covariance(tracked.keyframe)
+        to_frame = tracked.T_keyframe_frame
+        return pose.compose(to_frame), compose_covariance(pose, covariance, to_frame, tracked.covariance)
 
     def finish(self) -> MapUpdate | None:
         """The map with every keyframe drawn where it is by now; None before the first."""
@@ -100,11 +124,21 @@ class Mapper:
             "submaps": sum(size > 1 for size in sizes),
             "unlinked": sum(size == 1 for size in sizes),
             "loop_closures": sum(edge.loop for edge in graph.edges),
-            "scale_sigma": graph.sigmas(keyframe)[1],
+            "scale_sigma": graph.scale_sigma(keyframe),
             "buildings": len(found.local_map),
             "cut": int(found.local_map.cut.sum()),
             "redraws_waiting": self._fusion.waiting,
             **dict(sorted(self._atlas.counts.items())),
             "seconds": time.perf_counter() - started,
         }
-        return MapUpdate(keyframes, found.local_map, found.outlines, funnel)
+        return MapUpdate(keyframes, found.local_map, found.outlines, funnel, tuple(_links(graph)))
+
+
+def _links(graph: PoseGraph) -> Iterator[tuple[int, int, str]]:
+    """The edges of a graph as MapUpdate tells them: a keyframe's first one is that to its predecessor."""
+    place = {keyframe: i for i, keyframe in enumerate(graph.poses)}
+    linked: set[int] = set()
+    for edge in graph.edges:
+        kind = "loop" if edge.loop else "skip" if edge.later in linked else "consecutive"
+        yield place[edge.earlier], place[edge.later], kind
+        linked.add(edge.later)

@@ -23,8 +23,8 @@ LOOP_ROUNDS = 6  # where a loop closure moves many
 
 @dataclass(frozen=True)
 class Edge:
-    """Measured pose of keyframe ``later`` in keyframe ``earlier``, and the fit's own (4, 4) covariance over
-    x, y, yaw and log scale."""
+    """Measured pose of keyframe ``later`` in keyframe ``earlier``, how many matches agree, and the (4, 4)
+    covariance over x, y, yaw and log scale. Loop closures weigh more."""
 
     earlier: int
     later: int
@@ -72,25 +72,13 @@ def _robust(noise: gtsam.noiseModel.Base, config: MapperConfig) -> gtsam.noiseMo
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(config.huber_k), noise)
 
 
-def edge_covariance(edge: Edge, config: MapperConfig) -> FloatArray:
-    """(4, 4) over x, y, yaw, log scale: what the fit knows of its pixels, and what it does not know (relief,
-    lens, attitude), which shrinks with the inliers. Loop closures weigh more."""
-    unknown = np.square(
-        [
-            config.sigma_position_m, config.sigma_position_m,
-            math.radians(config.sigma_rotation_deg), config.sigma_log_scale,
-        ]
-    )  # fmt: skip
-    spread = edge.covariance + np.diag(unknown) * config.min_inliers / edge.inliers
-    return np.asarray(spread / (config.loop_weight**2 if edge.loop else 1.0), dtype=np.float64)
-
-
 def _edge_factor(edge: Edge, config: MapperConfig) -> gtsam.NonlinearFactor:
     # gtsam's error is a step from the measured pose in its own axes: the covariance is turned into them.
     c, s = math.cos(edge.transform.yaw_rad), math.sin(edge.transform.yaw_rad)
     turn = np.eye(4)
     turn[:2, :2] = np.array([[c, s], [-s, c]]) / edge.transform.scale
-    noise = gtsam.noiseModel.Gaussian.Covariance(turn @ edge_covariance(edge, config) @ turn.T)
+    turn /= config.loop_weight if edge.loop else 1.0
+    noise = gtsam.noiseModel.Gaussian.Covariance(turn @ edge.covariance @ turn.T)
     return gtsam.BetweenFactorSimilarity2(
         _pose(edge.earlier), _pose(edge.later), _to_gtsam(edge.transform), _robust(noise, config)
     )
@@ -166,6 +154,7 @@ class PoseGraph:
         self._turns: list[Turn] = []
         self.edges: list[Edge] = []
         self.poses: dict[int, Similarity] = {}
+        self._covariances: dict[int, FloatArray] = {}  # asked for since the last change
         self._isam = gtsam.ISAM2(_parameters())
 
     def add(
@@ -206,12 +195,26 @@ class PoseGraph:
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, _values(self.poses), params)
         return self._poses_of(optimizer.optimize())
 
-    def sigmas(self, keyframe: int) -> tuple[float, float]:
-        """Standard deviations of a keyframe's place, m, as seen from the first keyframe, and of its scale,
-        relative; the altimeter's bias is in the second alone, since it scales all."""
-        covariance = self._isam.marginalCovariance(_pose(keyframe))
-        place = self.poses[keyframe].scale * math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
-        return place, math.hypot(math.sqrt(float(covariance[3, 3])), self._config.altitude_bias)
+    def covariance(self, keyframe: int) -> FloatArray:
+        """(4, 4) of a keyframe's pose over x, y, yaw and log scale, as seen from the first keyframe; the
+        altimeter's bias is not in it."""
+        if keyframe in self._covariances:
+            return self._covariances[keyframe]
+        pose = self.poses[keyframe]
+        c, s = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
+        turn = np.eye(4)
+        turn[:2, :2] = np.array([[c, -s], [s, c]]) * pose.scale
+        own_axes = self._isam.marginalCovariance(_pose(keyframe))
+        self._covariances[keyframe] = np.asarray(turn @ own_axes @ turn.T, dtype=np.float64)
+        return self._covariances[keyframe]
+
+    def place_sigma_m(self, keyframe: int) -> float:
+        """Standard deviation of a keyframe's place along the axis where it is largest."""
+        return math.sqrt(float(np.linalg.eigvalsh(self.covariance(keyframe)[:2, :2])[-1]))
+
+    def scale_sigma(self, keyframe: int) -> float:
+        """Relative standard deviation of a keyframe's scale, the altimeter's bias included."""
+        return math.hypot(math.sqrt(float(self.covariance(keyframe)[3, 3])), self._config.altitude_bias)
 
     def _chain(self) -> list[gtsam.NonlinearFactor]:
         """What every keyframe has without any link, in the order they were flown."""
@@ -233,6 +236,7 @@ class PoseGraph:
         self._isam.update(graph, _values(guesses))
         for _ in range((LOOP_ROUNDS if any(edge.loop for edge in edges) else ROUNDS) - 1):
             self._isam.update()
+        self._covariances.clear()
         self.edges += edges
         self._turns += turns
         self.poses = self._poses_of(self._isam.calculateEstimate())

@@ -68,7 +68,7 @@ class Link:
 
     Images are already metric by their own altitudes, so the altitude ratio of the pair is divided out: the
     scale is 1 up to errors of altitude and terrain. ``covariance`` (4, 4) is that of the fit, over x, y,
-    yaw, log scale; errors of telemetry are not in it.
+    yaw, log scale; errors of telemetry are not in it (:func:`link_covariance`).
     """
 
     transform: Similarity
@@ -210,6 +210,18 @@ class Registration:
         if abs(deviation) > math.radians(self._config.max_yaw_deviation_deg):
             return Rejection("yaw")
         return None
+
+
+def link_covariance(link: Link, config: MapperConfig) -> FloatArray:
+    """(4, 4) over x, y, yaw, log scale: what the fit knows of its pixels, and what it does not know (relief,
+    lens, attitude), which shrinks with the inliers."""
+    unknown = np.square(
+        [
+            config.sigma_position_m, config.sigma_position_m,
+            math.radians(config.sigma_rotation_deg), config.sigma_log_scale,
+        ]
+    )  # fmt: skip
+    return np.asarray(link.covariance + np.diag(unknown) * config.min_inliers / link.inliers)
 
 
 def robust_similarity(

@@ -40,7 +40,7 @@ def elsewhere(index: int) -> Frame:
     return replace(frame, image_bgr=np.kron(noise, np.ones((8, 8, 1), dtype=np.uint8)))
 
 
-def flown(frames: list[Frame], config: MapperConfig = CONFIG) -> tuple[Atlas, list[int | None]]:
+def flown(frames: list[Frame], config: MapperConfig = CONFIG) -> tuple[Atlas, list[int]]:
     atlas = Atlas(config)
     return atlas, [atlas.add(frame) for frame in frames]
 
@@ -59,11 +59,22 @@ def test_a_foreign_frame_stays_alone_and_the_flight_goes_on() -> None:
     assert places(atlas, [0, 2, 3]) == pytest.approx(np.array([(0, 0), (15, 0), (30, 0)]), abs=0.2)
 
 
-def test_featureless_frames_are_counted_and_take_no_id() -> None:
-    atlas, ids = flown([at(0, -50.0, 0.0), black(1), black(2), at(3, -35.0, 0.0)])
-    assert ids == [0, None, None, 1]
-    assert atlas.counts["rejected_featureless"] == 2
-    assert len(atlas.submap(1).poses) == 2
+def test_black_frames_stay_alone_and_are_counted() -> None:
+    atlas, _ = flown([at(0, -50.0, 0.0), black(1), black(2), at(3, -35.0, 0.0)])
+    assert list(atlas.submap(3).poses) == [0, 3]
+    assert len(atlas.submaps()) == 3
+    assert atlas.counts["rejected_few_matches"] >= 3  # 1 to 0, 2 to 1 and 0, 3 to 2 and 1
+
+
+def test_featureless_water_ends_a_submap_and_a_revisit_joins_what_lies_on_both_sides() -> None:
+    water = [black(i) for i in range(2, 7)]
+    there = [at(7, 40.0, 60.0), at(8, 30.0, 60.0)]
+    back = [at(9, 15.0, 40.0), at(10, -10.0, 15.0), at(11, -40.0, -5.0, 2.0), at(12, -48.0, 0.0, 2.0)]
+    atlas, _ = flown([at(0, -50.0, 0.0), at(1, -40.0, 0.0), *water, *there, *back])
+    joined = atlas.submap(12)
+    assert list(joined.poses) == [0, 1, 7, 8, 9, 10, 11, 12]
+    true = np.array([(-50, 0), (-40, 0), (40, 60), (30, 60), (15, 40), (-10, 15), (-40, -5), (-48, 0)])
+    assert places(atlas, list(joined.poses)) == pytest.approx(true - true[0], abs=1.5)
 
 
 LOST = [at(0, -70.0, -60.0), at(1, -55.0, -60.0), at(2, 55.0, 70.0), at(3, 40.0, 70.0)]
@@ -125,7 +136,7 @@ def test_an_altimeter_that_is_off_by_3_percent_scales_the_map_and_the_sigma_says
     atlas, _ = flown(frames)
     length = float(np.linalg.norm(places(atlas, [0, 4])[1])) / math.dist(path[0], path[4])
     assert length == pytest.approx(1.03, abs=0.003)
-    assert abs(length - 1.0) < 2.0 * atlas.submap(4).sigmas(4)[1]
+    assert abs(length - 1.0) < 2.0 * atlas.submap(4).scale_sigma(4)
     assert atlas.submap(4).poses[4].scale == pytest.approx(1.0, abs=0.003)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from buildloc_mapper.config import MapperConfig
 from buildloc_mapper.pose_graph import Edge, PoseGraph, Turn
+from buildloc_mapper.registration import Link, link_covariance
 from buildloc_mapper.similarity import Similarity
 
 CONFIG = MapperConfig()
@@ -24,7 +25,8 @@ HALF_A_LINK = 0.5 * np.array(
 
 
 def edge(earlier: int, later: int, transform: Similarity, inliers: int = 60, loop: bool = False) -> Edge:
-    return Edge(earlier, later, transform, inliers, NO_NOISE, loop)
+    covariance = link_covariance(Link(transform, inliers, NO_NOISE), CONFIG)
+    return Edge(earlier, later, transform, inliers, covariance, loop)
 
 
 def chained(edges: list[Edge], config: MapperConfig = CONFIG) -> PoseGraph:
@@ -91,7 +93,7 @@ def test_loop_closures_take_most_of_the_drift_out() -> None:
     assert error(flown) < 0.6 * error(blind)
     # Seen from the start, a keyframe that was just tied to the first lap is surer than one that was not.
     last = len(truth) - 1
-    assert flown.sigmas(last)[0] < 0.7 * blind.sigmas(last)[0]
+    assert flown.place_sigma_m(last) < 0.7 * blind.place_sigma_m(last)
 
 
 def test_the_told_uncertainty_of_a_place_is_that_of_many_flights() -> None:
@@ -100,7 +102,6 @@ def test_the_told_uncertainty_of_a_place_is_that_of_many_flights() -> None:
     config = replace(CONFIG, altitude_noise=1e-3, altitude_drift=0.0)
     step, sigma = Similarity(20.0, 0.0, 0.1, 1.0), np.array([0.3, 0.1, 0.005, 0.002])
     for _ in range(60):
-        config = replace(config, sigma_position_m=1e-3, sigma_rotation_deg=1e-3, sigma_log_scale=1e-5)
         graph = PoseGraph(config)
         graph.add(0, 0, ORIGIN, [])
         true = ORIGIN
@@ -109,7 +110,7 @@ def test_the_told_uncertainty_of_a_place_is_that_of_many_flights() -> None:
             graph.add(i, i * SECOND, graph.poses[i - 1].compose(link.transform), [link])
             true = true.compose(step)
         # The larger axis of the ellipse is told: the error along any axis is below it.
-        over.append(math.dist(graph.poses[11][:2], true[:2]) / graph.sigmas(11)[0])
+        over.append(math.dist(graph.poses[11][:2], true[:2]) / graph.place_sigma_m(11))
     assert 0.6 < np.sqrt(np.mean(np.square(over))) < math.sqrt(2.0)
 
 
@@ -175,10 +176,10 @@ def test_a_drifting_altimeter_is_followed_and_a_noisy_one_is_not() -> None:
 def test_the_uncertainty_of_scale_never_falls_below_the_bias_that_no_image_can_tell() -> None:
     _, edges = laps(1)
     graph = chained(edges)
-    assert 0.03 <= graph.sigmas(59)[1] < 0.05
-    assert graph.sigmas(1)[1] > CONFIG.altitude_bias
+    assert 0.03 <= graph.scale_sigma(59) < 0.05
+    assert graph.scale_sigma(1) > CONFIG.altitude_bias
     biased = chained(edges, replace(CONFIG, altitude_bias=0.1))
-    assert biased.sigmas(59)[1] > 0.1
+    assert biased.scale_sigma(59) > 0.1
     assert apart(biased.poses, graph.poses).max() == 0.0
 
 
