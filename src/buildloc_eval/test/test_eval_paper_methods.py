@@ -232,13 +232,12 @@ def test_recall_has_an_interval_and_errors_are_of_the_right_ones() -> None:
     assert error_row(scores[-1:])["final_median_m"] is None
 
 
-def test_kept_results_are_made_once(tmp_path: Path) -> None:
-    store, made = Store(tmp_path / "stage", {"seed": 1}), []
-    for _ in range(2):
-        assert store.get("one", lambda: made.append(1) or 5) == 5
-    assert made == [1]
-    assert Store(tmp_path / "stage", {"seed": 1}).load("one") == 5
-    assert not list((tmp_path / "stage").glob("*.part"))
+def test_results_are_kept_whole(tmp_path: Path) -> None:
+    store = Store(tmp_path / "stage", {"seed": 1})
+    assert not store.has("one")
+    store.save("one", {"a": 5})
+    assert Store(tmp_path / "stage", {"seed": 1}).load("one") == {"a": 5}
+    assert {path.name for path in store.folder.iterdir()} == {"made_by.json", "one.pickle"}
 
 
 def test_results_of_another_configuration_or_code_are_refused(tmp_path: Path) -> None:
