@@ -449,7 +449,7 @@ def parser() -> argparse.ArgumentParser:
             help="middle of the area; in the south write --center=-33.9,151.2",
         ),
         _argument("--radius-km", type=float, required=True, help="how far around the centre, km"),
-        _argument("--out", type=Path, required=True, help="folder for the files and their manifest"),
+        _argument("-o", "--out", type=Path, required=True, help="folder for the files and their manifest"),
         _argument("--index-url", help="Microsoft's dataset-links.csv, if it has moved or is mirrored"),
     )  # fmt: skip
     preset = _argument("--preset", help="parameters of the matcher: default or paper")
@@ -457,7 +457,7 @@ def parser() -> argparse.ArgumentParser:
         _command(
             refdb_commands, "build", "describe building footprints", _refdb_build,
             _argument("sources", type=Path, nargs="+", help="footprint files or folders, the best first"),
-            _argument("--out", type=Path, required=True, help="database to write"),
+            _argument("-o", "--out", type=Path, required=True, help="database to write"),
             _argument("--center", type=_location, metavar="LAT,LON", help="keep what lies around here"),
             _argument("--radius-km", type=float, help="how far around the centre, km"),
             _argument("--bbox", type=_box, metavar="WEST,SOUTH,EAST,NORTH", help="keep what lies here"),
@@ -477,7 +477,7 @@ def parser() -> argparse.ArgumentParser:
         ),
         _command(
             commands, "map", "map file and trajectory of a bag", _map, bag,
-            _argument("--out", type=Path, required=True, help="GeoJSON or GeoParquet, local metres"),
+            _argument("-o", "--out", type=Path, required=True, help="GeoJSON or GeoParquet, local metres"),
             _argument("--trajectory", type=Path, help="keyframe poses in TUM format"),
             _argument(
                 "--plot", type=Path, nargs="?", const=True, metavar="FILE",
@@ -498,13 +498,13 @@ def parser() -> argparse.ArgumentParser:
         _command(
             commands, "run", "fixes of a bag, offline and deterministic", _run, bag, database,
             preset,
-            _argument("--out", type=Path, help="JSON lines, one per keyframe"),
+            _argument("-o", "--out", type=Path, help="JSON lines, one per keyframe"),
         ),
         _command(
             commands, "replay", "play a bag into the live nodes", _replay, bag,
             _argument("--database", type=Path, help="reference database"),
             _argument("--rate", type=float, default=1.0, help="speed relative to the recording"),
-            _argument("--out", type=Path, help="JSON lines of what arrived on /buildloc/fix"),
+            _argument("-o", "--out", type=Path, help="JSON lines of what arrived on /buildloc/fix"),
             _argument("--no-nodes", action="store_true", help="the nodes run already, elsewhere"),
             preset,
         ),

@@ -6,11 +6,11 @@ import math
 
 import cv2
 import numpy as np
-from buildloc_msgs_py.ground import camera_matrix, level_matrix, pixels_to_level
+from buildloc_msgs_py.ground import camera_matrix, level_to_ray, pixels_to_level
 from buildloc_msgs_py.types import ByteArray, CameraModel, FloatArray
 
 from buildloc_eval.flight import FlightConfig, focal_px
-from buildloc_eval.world import World, WorldError
+from buildloc_eval.world import Surface, WorldError
 
 Quaternion = tuple[float, float, float, float]
 
@@ -40,8 +40,16 @@ def level_to_world(x_m: float, y_m: float, yaw_rad: float) -> FloatArray:
     return np.array([[c, -s, x_m], [s, c, y_m], [0.0, 0.0, 1.0]])
 
 
+def world_to_rays(pose: tuple[float, float, float, float], attitude_xyzw: Quaternion) -> FloatArray:
+    """(3, 3) from (x, y, 1), metres of the world, to a ray in camera axes; ``pose`` as in :func:`look`."""
+    x, y, altitude, yaw = pose
+    return np.asarray(
+        level_to_ray(altitude, attitude_xyzw) @ np.linalg.inv(level_to_world(x, y, yaw)), dtype=np.float64
+    )
+
+
 def look(
-    world: World, camera: CameraModel, pose: tuple[float, float, float, float], attitude_xyzw: Quaternion
+    world: Surface, camera: CameraModel, pose: tuple[float, float, float, float], attitude_xyzw: Quaternion
 ) -> ByteArray:
     """The world as it is, (H, W) or (H, W, 3), from ``pose``: x, y, altitude in m, ENU yaw of image-right.
 
@@ -66,7 +74,7 @@ def look(
             [0, 0, 1.0],
         ]
     )
-    rays = camera_matrix(camera) @ level_matrix(attitude_xyzw).T @ np.diag([1.0, -1.0, altitude])
+    rays = camera_matrix(camera) @ level_to_ray(altitude, attitude_xyzw)
     homography = to_window @ level_to_world(0.0, 0.0, yaw) @ np.linalg.inv(rays)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     seen = cv2.warpPerspective(window.image_bgr, homography, (camera.width, camera.height), flags=flags)
@@ -74,7 +82,7 @@ def look(
 
 
 def photograph(
-    world: World,
+    world: Surface,
     camera: CameraModel,
     pose: tuple[float, float, float, float],
     attitude_xyzw: Quaternion,

@@ -8,6 +8,7 @@ import math
 import os
 import sys
 from pathlib import Path
+from typing import Literal
 
 from buildloc.settings import REFERENCE_DB, SEGMENTER, config_of, load
 from buildloc_msgs_py.config import from_mapping
@@ -44,6 +45,14 @@ def _extent(text: str) -> float:
     return extent
 
 
+def _level(text: str) -> int | Literal["measured"]:
+    if text == "measured":
+        return "measured"
+    if not (text.isdecimal() and 1 <= int(text) <= 8):
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a whole number from 1 to 8 nor measured")
+    return int(text)
+
+
 def _progress(done: int, total: int) -> None:
     if sys.stderr.isatty():
         print(f"\r{done}/{total} images", end="\n" if done == total else "", file=sys.stderr, flush=True)
@@ -51,7 +60,7 @@ def _progress(done: int, total: int) -> None:
 
 def add_sim_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `buildloc sim`; every field of FlightConfig is one."""
-    parser.add_argument("--out", type=Path, required=True, help="bag folder to write")
+    parser.add_argument("-o", "--out", type=Path, required=True, help="bag folder to write")
     world = parser.add_mutually_exclusive_group(required=True)
     world.add_argument("--ortho", type=Path, help="orthophoto to cut the flight out of (with --georef)")
     world.add_argument("--world", type=Path, help="GeoJSON of footprints to render the flight over")
@@ -110,7 +119,7 @@ def add_demo_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bag", type=Path, default=Path("bags/sample"), help="bag with ground truth")
     parser.add_argument("--footprints", type=Path, default=Path("bags/sample_footprints.geojson"))
     parser.add_argument("--rate", type=float, default=DEMO_RATE, help="speed relative to the recording")
-    parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder for what is made")
+    parser.add_argument("-o", "--out", type=Path, default=Path("out/demo"), help="folder for what is made")
 
 
 def run_demo(args: argparse.Namespace) -> int:
@@ -145,9 +154,15 @@ def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "name", choices=["barnarp", "mapping", "scale", "segmentation"], help="which evaluation"
     )
-    parser.add_argument("--out", type=Path, required=True, help="folder for report.json and report.html")
+    parser.add_argument(
+        "-o", "--out", type=Path, required=True, help="folder for report.json and report.html"
+    )
     parser.add_argument("--seed", type=int, default=1, help="seed of everything random")
     parser.add_argument("--quick", action="store_true", help="a part of it, in less than five minutes")
+    parser.add_argument_group("eval scale").add_argument(
+        "--levels", nargs="+", type=_level, metavar="LEVEL",
+        help="levels of the maps' errors: numbers, or `measured` on the segmenter (default: 1 2 3)",
+    )  # fmt: skip
     group = parser.add_argument_group("eval segmentation")
     group.add_argument(
         "--case", action="append", default=[], metavar="PLACE=MODEL", dest="cases",
@@ -157,6 +172,13 @@ def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
         "--set", action="append", default=[], metavar="NODE.PARAMETER=VALUE", dest="overrides",
         help="parameter of networks without their own contract, such as segmenter_node.output=probability",
     )  # fmt: skip
+    group.add_argument(
+        "--speed", nargs="*", metavar="MODEL",
+        help="time networks beside each other (none named: the shipped one)",
+    )  # fmt: skip
+    group.add_argument(
+        "--write-errors", type=Path, metavar="FILE", help="measure the error model, write it here"
+    )
 
 
 def run_eval(args: argparse.Namespace) -> int:
@@ -164,14 +186,19 @@ def run_eval(args: argparse.Namespace) -> int:
     from buildloc.supervisor import dds_environment
 
     os.environ.update(dds_environment())
-    if args.name != "segmentation" and (args.cases or args.overrides):
+    if args.name != "segmentation" and (
+        args.cases or args.overrides or args.speed is not None or args.write_errors
+    ):
         raise BuildlocError(
-            f"--case and --set are of `eval segmentation`; leave them out of `eval {args.name}`"
+            f"--case, --set, --speed and --write-errors are of `eval segmentation`, not of `eval {args.name}`"
         )
+    if args.name != "scale" and args.levels:
+        raise BuildlocError(f"--levels is of `eval scale`, not of `eval {args.name}`")
     if args.name == "scale":
         from buildloc_eval import scale
 
-        print(scale.evaluate(args.out, args.seed, args.quick, _stage))
+        levels = None if args.levels is None else tuple(args.levels)
+        print(scale.evaluate(args.out, args.seed, args.quick, _stage, levels))
     elif args.name == "mapping":
         from buildloc_eval import mapping
 
@@ -179,9 +206,11 @@ def run_eval(args: argparse.Namespace) -> int:
     elif args.name == "segmentation":
         from buildloc_eval import segmentation
 
-        cases = [segmentation.parse_case(text) for text in args.cases] or segmentation.DEFAULT
+        cases = tuple(segmentation.parse_case(text) for text in args.cases) or segmentation.DEFAULT
         config = config_of(load(None, args.overrides), SEGMENTER, SegmenterConfig)
-        print(segmentation.evaluate(args.out, args.seed, args.quick, cases, config, _stage))
+        speed = () if args.speed is None else tuple(args.speed) or ("",)
+        plan = segmentation.Plan(cases, config, args.seed, args.quick, speed, args.write_errors)
+        print(segmentation.evaluate(args.out, plan, _stage))
     else:
         from buildloc_eval import barnarp
 

@@ -2,19 +2,22 @@
 
 Two sources of error lie between a reference and a map. The reference was digitised by somebody else than
 nature: figures from PLATEAU against OpenStreetMap over Tokyo. And the drone misses, invents and shifts
-buildings and bends the map along its path: levels 1 to 3.
+buildings and bends the map along its path: levels 1 to 3, or what a segmenter was measured to do.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from buildloc_matcher.reference.buildings import Buildings
 from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.types import FloatArray, LocalMap
 from scipy.spatial import cKDTree
+
+from buildloc_eval.segmentation_errors import read_errors
 
 STEP_M = 5.0
 LONGEST_PATH_M = 6_000.0
@@ -47,18 +50,36 @@ class Digitiser:
 @dataclass(frozen=True)
 class Sensing:
     """What the drone does to the buildings it flies over: shares missed and invented, centroid jitter per
-    axis, random walk of the heading over 10 m, standard deviation of the scale."""
+    axis, random walk of the heading over 10 m, standard deviation of the scale; bias and standard deviation
+    of log area and standard deviations of the four shape metrics, beyond those of the digitiser."""
 
     missed: float
     false: float
     jitter_m: float
     heading_walk_deg: float
     scale_sigma: float
+    log_area_bias: float = 0.0
+    log_area_sigma: float = 0.0
+    shape_sigma: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
 
-def sensing(level: float) -> Sensing:
-    """Level n is n times level 1: 12 % missed, 8 % false, 1.2 m, 0.15 deg per 10 m, 1 %."""
-    return Sensing(0.12 * level, 0.08 * level, 1.2 * level, 0.15 * level, 0.01 * level)
+Level = float | Literal["measured"]
+
+
+def sensing(level: Level) -> Sensing:
+    """Level n is n times level 1: 12 % missed, 8 % false, 1.2 m, 0.15 deg per 10 m, 1 %.
+
+    "measured": what a single view of the segmenter does to buildings on ground it never saw (a merged one is
+    missed too: its centroid is that of two), with the heading and scale of level 1. Raises ErrorModelError.
+    """
+    if level != "measured":
+        return Sensing(0.12 * level, 0.08 * level, 1.2 * level, 0.15 * level, 0.01 * level)
+    errors, one = read_errors(), sensing(1)
+    return Sensing(
+        min(errors.missed + errors.merged, 0.95), errors.false_share, errors.centroid_sigma_m,
+        one.heading_walk_deg, one.scale_sigma,
+        errors.log_area_bias, errors.log_area_sigma, errors.shape_sigma,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -171,8 +192,12 @@ def _observe_along(
     yaw, scale = rng.uniform(-math.pi, math.pi), 1.0 + rng.normal(0.0, model.scale_sigma)
     turn = scale * np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
     local = (placed - placed[0]) @ turn.T
-    areas = reference.areas_m2[source] * np.exp(rng.normal(0.0, digitiser.log_area_sigma, count)) * scale**2
-    noisy = reference.shapes[source] + rng.normal(0.0, digitiser.shape_sigma, (count, 4))
+    log_area_sigma = math.hypot(digitiser.log_area_sigma, model.log_area_sigma)
+    log_areas = rng.normal(0.0, log_area_sigma, count) + model.log_area_bias
+    areas = reference.areas_m2[source] * np.exp(log_areas) * scale**2
+    noisy = reference.shapes[source] + rng.normal(
+        0.0, np.hypot(digitiser.shape_sigma, model.shape_sigma), (count, 4)
+    )
     ids = np.arange(count, dtype=np.int64)
     local_map = LocalMap.whole(0, ids, local, areas, np.clip(noisy, 0.05, 1.0), np.ones_like(ids))
     return ObservedMap(local_map, true, float(along.max()) * STEP_M)

@@ -42,13 +42,10 @@ def overlay(scored: Scored, centre_m: FloatArray) -> ByteArray:
     r0, c0 = (inside[0].start - top) * ZOOM, (inside[1].start - left) * ZOOM
     part = picture[r0 : r0 + height * ZOOM, c0 : c0 + width * ZOOM]
     part[:] = cv2.resize(bgr(scored.truth)[inside], part.shape[1::-1], interpolation=cv2.INTER_CUBIC)
-    fine = [
-        np.repeat(np.repeat(layer[inside], ZOOM, axis=0), ZOOM, axis=1)
-        for layer in (scored.truth.labelled, scored.truth.buildings, scored.finds.instances)
-    ]
-    part[~fine[0]] //= 3
-    part[rim(fine[1])] = GREEN
-    part[rim(fine[2])] = MAGENTA
+    finer = np.ix_(np.arange(height * ZOOM) // ZOOM, np.arange(width * ZOOM) // ZOOM)
+    part[~scored.truth.labelled[inside][finer]] //= 3
+    part[rim(scored.truth.buildings[inside][finer])] = GREEN
+    part[rim(scored.finds.instances[inside][finer])] = MAGENTA
     return picture
 
 

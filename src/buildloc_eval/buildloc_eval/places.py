@@ -142,7 +142,7 @@ def read_web_tiles(images: Path, masks: Path, only_zoom: int | None = None) -> I
 def web_tile_gsd_m(y: float, zoom: int, side_px: int) -> float:
     """Ground sampling distance of a web-mercator tile in row ``y``."""
     latitude = math.atan(math.sinh(math.pi * (1.0 - 2.0 * y / 2**zoom)))
-    return EQUATOR_M * math.cos(latitude) / (2**zoom * side_px)
+    return float(EQUATOR_M * math.cos(latitude) / (2**zoom * side_px))
 
 
 def drawn(outlines_px: list[shapely.Polygon], shape: tuple[int, int]) -> Labels:

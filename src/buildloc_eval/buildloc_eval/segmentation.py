@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,17 +24,20 @@ from buildloc_eval.instance_metrics import (
     pooled,
 )
 from buildloc_eval.machine import machine
+from buildloc_eval.overlapping import Overlap, flicker, overlaps
 from buildloc_eval.overlays import draw_windows, largest
 from buildloc_eval.places import Scene, overlap, patches, place
 from buildloc_eval.realworld import data_folder
+from buildloc_eval.segmentation_errors import POOLED, SegmentationErrors, measured, summary, write_errors
 from buildloc_eval.segmented import SCORED_GSD_M, Scored, busiest, disturbed, score
+from buildloc_eval.speed import frame_jpeg, speed, speed_table
 
 Progress = Callable[[str], None]
 
 TRAINING_KEY = "buildloc_training"  # of the ONNX file's metadata: JSON with the places that trained it
 ONE_ZOOM = 20  # of web tiles: the zooms of a place show the same ground
 DISTURBED_SIDE_M = 350.0
-QUICK_SIDE_M = 250.0
+QUICK_SIDE_M = 320.0  # four frames overlap on it
 REAL = "imagery: real (orthophotos and drone imagery, outlines drawn by people); nothing is simulated"
 RULES = {
     "raster": f"{SCORED_GSD_M:g} m per pixel",
@@ -66,6 +69,19 @@ def parse_case(text: str) -> Case:
     if not (name and equals):
         raise EvaluationError(f"--case {text}: expected PLACE=MODEL, such as barnarp=network.onnx")
     return Case(name, model)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is evaluated: the cases, with these parameters of networks without their own contract; the
+    networks to be timed; where the error model is to be written, if so."""
+
+    cases: tuple[Case, ...]
+    config: SegmenterConfig
+    seed: int
+    quick: bool
+    speed: tuple[str, ...]
+    errors: Path | None
 
 
 DEFAULT = (Case("barnarp", ""),)  # the only place that never trains what is shipped
@@ -128,34 +144,37 @@ def robustness(network: Network, scene: Scene, progress: Progress) -> dict[str, 
 
 @dataclass(frozen=True)
 class CaseResult:
-    """What goes into the report, the pictures, and the comparison of the segmenter's instances."""
+    """What goes into the report, the pictures, and what the error model is made of: the comparison of the
+    mask on the wire and, where they were asked for, the overlapping frames."""
 
     report: dict[str, Any]
     pictures: list[tuple[str, Path]]
     comparison: Comparison
+    overlaps: list[Overlap]
 
 
-def run_case(
-    case: Case, config: SegmenterConfig, imagery: Path, out: Path, seed: int, quick: bool, progress: Progress
-) -> CaseResult:
+def run_case(case: Case, plan: Plan, imagery: Path, out: Path, progress: Progress) -> CaseResult:
     """Score a network on a place. Raises EvaluationError, PlaceError, NetworkError."""
-    network = Network(replace(config, model=case.model))
+    network = Network(replace(plan.config, model=case.model))
     training = trained_on(network)
     refuse_known_ground(case, training)
     scenes: dict[str, Any] = {}
-    pictures, everything = [], []
+    pictures, everything, frames = [], list[Scored](), list[Overlap]()
     widest: Scene | None = None
     for scene in place(imagery, case.place, ONE_ZOOM):
         progress(f"{case.place}: {scene.name}")
         parts = []
         for patch in patches(scene):
-            part = busiest(patch, QUICK_SIDE_M) if quick else patch
+            part = busiest(patch, QUICK_SIDE_M) if plan.quick else patch
             parts.append(score(network, part))
             widest = part if widest is None or part.labelled.sum() > widest.labelled.sum() else widest
+            if plan.errors is not None:
+                progress(f"{part.name}: overlapping frames")
+                frames += overlaps(network, part, plan.seed)
         main = max(parts, key=lambda part: len(part.instances.true))
         name = f"{case.place}_{scene.name.replace('/', '_')}"
         picture = out / f"{name}_{Path(case.model).stem or 'shipped'}.png"
-        draw_windows(picture, main, seed)
+        draw_windows(picture, main, plan.seed)
         pictures.append((f"{case.place}, {scene.name}: true outlines green, found ones magenta", picture))
         scenes[scene.name] = scores_of(parts) | {"largest failures": failures(main)}
         everything += parts
@@ -168,41 +187,62 @@ def run_case(
         "scenes": scenes,
         "disturbed input": robustness(network, widest, progress),
     }
-    return CaseResult(report, pictures, pooled([part.instances for part in everything]))
+    return CaseResult(report, pictures, pooled([part.wire for part in everything]), frames)
 
 
-def evaluate(
-    out: Path,
-    seed: int,
-    quick: bool,
-    cases: Sequence[Case],
-    config: SegmenterConfig,
-    progress: Progress,
-) -> str:
-    """Score every case, write report.json and report.html; the summary.
+def error_model(results: Sequence[CaseResult]) -> dict[str, SegmentationErrors]:
+    """The errors of each place that frames overlap over, and of all places together.
+
+    Raises EvaluationError when there is nothing to measure them on.
+    """
+    groups = [(result.report["place"], result.comparison, result.overlaps) for result in results]
+    together = (POOLED, pooled([r.comparison for r in results]), [o for r in results for o in r.overlaps])
+    found = {}
+    for name, comparison, frames in (together, *groups):
+        seen = flicker(frames)
+        if seen is not None and len(comparison.pairs.true):
+            found[name] = measured(comparison, seen)
+    if POOLED not in found:
+        raise EvaluationError(
+            "no two frames show the same building of these places; add a --case of wider ground"
+        )
+    return found
+
+
+def evaluate(out: Path, plan: Plan, progress: Progress) -> str:
+    """Score every case, write report.json and report.html, and the error model if asked for; the summary.
 
     Raises EvaluationError, PlaceError, NetworkError.
     """
     imagery = data_folder() / "imagery"
     out.mkdir(parents=True, exist_ok=True)
-    results = [run_case(case, config, imagery, out, seed, quick, progress) for case in cases]
+    results = [run_case(case, plan, imagery, out, progress) for case in plan.cases]
+    trained = {f"{r.report['model']} on {r.report['place']}": r.report["trained on"] for r in results}
+    errors = {} if plan.errors is None else error_model(results)
+    speeds: dict[str, Any] = {}
+    if plan.speed:
+        progress("speed")
+        speeds = speed(frame_jpeg(imagery), plan.speed, plan.config)
     report = {
         "evaluation": "segmentation",
         "what is real": REAL,
-        "what trained": {
-            f"{r.report['model']} on {r.report['place']}": r.report["trained on"] for r in results
-        },
+        "what trained": trained,
         "command": " ".join(["buildloc", *sys.argv[1:]]),
-        "seed": seed,
-        "quick": quick,
+        "seed": plan.seed,
+        "quick": plan.quick,
         "how it is counted": RULES,
         **machine(),
+        "speed": speeds,
+        "error model": {name: asdict(values) for name, values in errors.items()},
         "cases": {f"{r.report['place']}, {r.report['model']}": r.report for r in results},
     }
     (out / "report.json").write_text(json.dumps(report, indent=2) + "\n")
     pictures = [picture for result in results for picture in result.pictures]
     write_report(out / "report.html", "Segmentation of ground never seen", report, pictures)
-    return table([r.report for r in results])
+    if plan.errors is not None:
+        about = {key: report[key] for key in ("what is real", "what trained", "seed", "quick", "date")}
+        write_errors(plan.errors, about, errors)
+    return "\n".join([table([r.report for r in results]), *speed_table(speeds), *summary(errors)])
 
 
 COLUMNS = (

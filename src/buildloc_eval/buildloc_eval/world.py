@@ -41,12 +41,8 @@ class Window:
     gsd_m: float
 
 
-class World(Protocol):
-    """Ground that can be photographed."""
-
-    @property
-    def epsg(self) -> int:
-        """UTM zone of all coordinates."""
+class Surface(Protocol):
+    """Ground that can be photographed, in metres east and north of anywhere."""
 
     @property
     def bounds_m(self) -> Box:
@@ -54,6 +50,14 @@ class World(Protocol):
 
     def window(self, box_m: Box) -> Window:
         """At least the part of the box that lies within the bounds; raises WorldError outside."""
+
+
+class World(Surface, Protocol):
+    """A surface that has its place on Earth."""
+
+    @property
+    def epsg(self) -> int:
+        """UTM zone of all coordinates."""
 
 
 def utm_epsg(latitude_deg: float, longitude_deg: float) -> int:

@@ -54,7 +54,10 @@ class MapperConfig:
     redraw_px: float = param(
         0.5, "a keyframe that moved more than this is drawn anew, map pixels", 0.0, 100.0
     )
-    max_redraws: int = param(4, "keyframes drawn, or drawn anew, per keyframe; the others follow", 1, 100000)
+    max_redraws: int = param(3, "moved keyframes drawn anew per keyframe; the others follow", 0, 100000)
+    max_stale_m: float = param(
+        10.0, "keyframes that moved more than this are drawn anew at once, however many, m", 0.0, 1e6
+    )
     sigma_centroid_m: float = param(
         0.5, "standard deviation of a centroid in one keyframe, before any was compared, m", 0.001, 100.0
     )

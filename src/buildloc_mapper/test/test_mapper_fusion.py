@@ -126,7 +126,7 @@ def test_memory_follows_the_area() -> None:
     assert len(flight.fusion.counts) < 10
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(st.integers(0, 10**6))
 def test_incremental_is_what_fusing_from_scratch_gives(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -158,8 +158,25 @@ def test_only_what_moved_is_drawn_anew_and_at_most_so_much_per_update() -> None:
     flight.update()
     drawn = [flight.fusion.drawn[k].pose == pose for k, pose in flight.poses.items()]
     assert drawn == [False] * 4 + [True] * 2 and flight.fusion.waiting == 4  # those that moved most
+    far = {0: at(-20.0, 30.0, 0.1), 1: at(5000.0, 0.0), 2: at(0.0, 700.0)}  # a map joined to another one
+    flight.poses |= far
+    flight.update()
+    assert {k: flight.fusion.drawn[k].pose for k in far} == far and flight.fusion.waiting == 1
     assert flight.fusion.update(flight.views, flight.poses, everything=True)
     assert flight.fusion.waiting == 0
+
+
+def test_another_map_takes_the_place_of_the_last_and_joins_it() -> None:
+    flight = Flight(replace(CONFIG, max_redraws=1))
+    first = flight.fly(TOWN, *LINE, *LINE)
+    old = dict(flight.poses)
+    flight.poses = {}
+    flight.fly(TOWN, at(300, 0), at(301, 0))  # lost: a map of its own
+    assert flight.fusion.drawn.keys() == flight.poses.keys() == {12, 13}
+    flight.poses = {**old, 12: LINE[0], 13: LINE[1]}  # joined, in the frame of the first
+    joined = flight.update()
+    assert flight.fusion.waiting == 0 and len(joined.local_map) == len(first.local_map)
+    assert joined.local_map.ids.min() > first.local_map.ids.max()  # none is given again
 
 
 def test_an_impossible_height_is_refused_before_it_is_mapped() -> None:

@@ -1,0 +1,108 @@
+"""How long a frame takes from its JPEG to its buildings, stage by stage, and what memory that needs.
+
+A module of its own, for the process whose memory is measured to load nothing else.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from multiprocessing.queues import Queue
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from buildloc_segmenter.config import SegmenterConfig
+from buildloc_segmenter.instances import draw_mask, find_instances
+from buildloc_segmenter.network import Network
+
+SIZE = (1280, 720)
+GSD_M = 0.13  # of a frame from 105 m
+ORTHO_GSD_M = 0.16
+FRAMES = 15
+STAGES = ("decode", "resize and infer", "instances", "mask")
+DEADLINE_S = 600.0
+
+
+def frame_jpeg(imagery: Path) -> bytes:
+    """A frame cut from the middle of a real suburb, at GSD_M."""
+    ortho = np.asarray(cv2.imread(str(imagery / "barnarp" / "ortho.jpg")), dtype=np.uint8)
+    width, height = (round(side * GSD_M / ORTHO_GSD_M) for side in SIZE)
+    top, left = (ortho.shape[0] - height) // 2, (ortho.shape[1] - width) // 2
+    frame = cv2.resize(ortho[top : top + height, left : left + width], SIZE, interpolation=cv2.INTER_CUBIC)
+    return bytes(cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 85])[1])
+
+
+def stages(network: Network, config: SegmenterConfig, jpeg: bytes) -> dict[str, float]:
+    """Milliseconds of each stage for one frame."""
+    clock = [time.perf_counter()]
+    image = np.asarray(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR), dtype=np.uint8)
+    clock.append(time.perf_counter())
+    scores = network.scores(image, GSD_M)
+    clock.append(time.perf_counter())
+    found = find_instances(scores.building, scores.core, scores.gsd_m, config.min_component_m2, GSD_M)
+    clock.append(time.perf_counter())
+    draw_mask(found, SIZE)
+    clock.append(time.perf_counter())
+    return dict(zip(STAGES, (1e3 * np.diff(clock)).tolist(), strict=True))
+
+
+def speed(jpeg: bytes, models: Sequence[str], config: SegmenterConfig) -> dict[str, Any]:
+    """Median milliseconds by stage and peak memory of each network (empty: the shipped one), in turns so that
+    what else the machine does meets all; ``times the first`` compares the sum with that of the first."""
+    networks = {model or "shipped": Network(replace(config, model=model)) for model in models}
+    runs: dict[str, list[dict[str, float]]] = {name: [] for name in networks}
+    for turn in range(FRAMES + 1):
+        for name, network in networks.items():
+            found = stages(network, config, jpeg)
+            if turn > 0:  # the first one loads
+                runs[name].append(found)
+    report: dict[str, Any] = {
+        "load average": os.getloadavg()[0],
+        "frame": f"{SIZE[0]}x{SIZE[1]} at {GSD_M} m",
+    }
+    first = 0.0
+    for name, model in zip(networks, models, strict=True):
+        median = {stage: float(np.median([run[stage] for run in runs[name]])) for stage in runs[name][0]}
+        whole = float(np.median([sum(run.values()) for run in runs[name]]))
+        first = first or whole
+        memory = peak_memory_mb(replace(config, model=model), jpeg)
+        report[name] = {
+            "ms": median, "ms_total": whole, "times the first": whole / first, "peak_memory_mb": memory
+        }  # fmt: skip
+    return report
+
+
+def speed_table(report: dict[str, Any]) -> list[str]:
+    """For people."""
+    return [
+        f"{name}: {values['ms_total']:.0f} ms a frame ({values['times the first']:.2f} times the first), "
+        + ", ".join(f"{stage} {ms:.0f}" for stage, ms in values["ms"].items())
+        + f"; peak memory {values['peak_memory_mb']:.0f} MB; load average {report['load average']:.1f}"
+        for name, values in report.items()
+        if isinstance(values, dict)
+    ]
+
+
+def peak_memory_mb(config: SegmenterConfig, jpeg: bytes) -> float:
+    """Peak resident memory, MB, of a process that segments a frame twice; libraries are in it."""
+    context = multiprocessing.get_context("spawn")
+    answer: Queue[float] = context.Queue()
+    process = context.Process(target=_segment, args=(config, jpeg, answer))
+    process.start()
+    peak = answer.get(timeout=DEADLINE_S)
+    process.join()
+    return peak
+
+
+def _segment(config: SegmenterConfig, jpeg: bytes, answer: Queue[float]) -> None:
+    network = Network(config)
+    for _ in range(2):
+        stages(network, config, jpeg)
+    status = Path("/proc/self/status").read_text().splitlines()
+    peak = next(line for line in status if line.startswith("VmHWM"))
+    answer.put(float(peak.split()[1]) / 1024.0)
