@@ -33,6 +33,7 @@ UNUSABLE: dict[str, tuple[dict[str, Any], str]] = {  # every image is, and why
     "encoding": ({"encoding": "bayer_rggb8"}, "'bayer_rggb8' is not supported"),
     "size": ({"info_width": WIDTH + 1}, "camera_info says 97x64"),
     "NaN altitude": ({"altitude_m": math.nan}, "altitude nan m is not a positive number"),
+    "zero altitude": ({"altitude_m": 0.0}, "altitude 0.0 m is not a positive number"),
     "negative altitude": ({"altitude_m": -10.0}, "altitude -10.0 m is not a positive number"),
 }
 

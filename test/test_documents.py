@@ -49,7 +49,7 @@ def test_paths_exist(document: Path) -> None:
     own = [name for name in names if re.fullmatch(r"(src|docs|bags|test|training|ros2_ws)(/[\w./]+)?", name)]
     assert [name for name in own if not (ROOT / name).exists()] == []
     modules = [name for name in names if re.fullmatch(r"[\w/]+\.py", name)]
-    known = [path.as_posix() for part in ("src", "training") for path in (ROOT / part).rglob("*.py")]
+    known = [path.as_posix() for part in ("src", "training", "test") for path in (ROOT / part).rglob("*.py")]
     assert [name for name in modules if not any(path.endswith(f"/{name}") for path in known)] == []
 
 

@@ -88,18 +88,21 @@ def rectangle(centre: Points, length: float, width: float, angle: float) -> Poin
 
 @dataclass(frozen=True)
 class Light:
-    """Direction of the shadows in the picture, shadow length per height, darkness of the shade."""
+    """Direction of the shadows in the picture, shadow length per height, darkness of the shade, and how far
+    the camera's view lets walls lean out per height."""
 
     away: Points
     stretch: float
     shade: float
+    lean: Points
 
     @staticmethod
     def drawn(rng: np.random.Generator) -> Light:
         """A sun anywhere from high to low, or an overcast sky."""
         angle = rng.uniform(0.0, math.tau)
-        shade = rng.uniform(0.25, 0.6) if rng.random() < 0.8 else rng.uniform(0.8, 1.0)
-        return Light(np.array([math.cos(angle), math.sin(angle)]), rng.uniform(0.3, 1.6), shade)
+        shade = rng.uniform(0.15, 0.6) if rng.random() < 0.8 else rng.uniform(0.8, 1.0)
+        away = np.array([math.cos(angle), math.sin(angle)])
+        return Light(away, rng.uniform(0.3, 1.8), shade, rng.normal(0.0, 0.12, 2))
 
 
 class Canvas:
@@ -165,6 +168,11 @@ class Canvas:
             along = np.array([math.cos(angle), math.sin(angle)]) * self.rng.uniform(-0.7, 0.7) * self.side
             self.car(centre + side + along, angle)
 
+    def yard(self, centre: Points, angle: float) -> None:
+        """Bare paving."""
+        outline = rectangle(centre, self.px(3.0, 20.0), self.px(2.5, 10.0), angle)
+        self.paint(outline, self.paving(), self.rng.uniform(2.0, 7.0))
+
     def car_park(self, centre: Points, angle: float) -> None:
         """Rows of bays, some taken."""
         length, depth = self.px(8.0, 30.0), self.px(5.0, 18.0)
@@ -185,6 +193,45 @@ class Canvas:
                 )
             if self.rng.random() < 0.4:
                 self.car(at, angle + math.pi / 2.0)
+
+    def pool(self, centre: Points, angle: float) -> None:
+        """Water with a rim: a basin, a round pool, a trampoline, at times a pond."""
+        rng = self.rng
+        water = np.array([70, 150, 190], dtype=np.float32) * rng.uniform(0.6, 1.2, 3).astype(np.float32)
+        if rng.random() < 0.35:
+            water = np.array([30, 38, 44], dtype=np.float32) * np.float32(rng.uniform(0.4, 1.3))
+        turns = np.linspace(0.0, math.tau, 20, endpoint=False)
+        disc = np.column_stack([np.cos(turns), np.sin(turns)])
+        if rng.random() < 0.15:
+            shape = disc * self.px(4.0, 14.0) * rng.uniform(0.8, 1.2, (20, 1))
+        elif rng.random() < 0.5:
+            shape = disc * self.px(1.5, 3.0)
+        else:
+            shape = rectangle(np.zeros(2), self.px(5.0, 11.0), self.px(3.0, 5.0), angle)
+        self.paint(centre + shape * 1.12, self.paving() * 1.2, 3.0)
+        self.paint(centre + shape, water, 3.0)
+
+    def hedge(self, centre: Points, angle: float) -> None:
+        """A hedge, fence or wall with its shadow."""
+        line = rectangle(centre, self.px(6.0, 35.0), self.px(0.2, 1.6), angle)
+        self.shade(line, self.px(0.8, 2.0))
+        green = np.array([50, 72, 38], dtype=np.float32)
+        colour = (
+            green * np.float32(self.rng.uniform(0.6, 1.3)) if self.rng.random() < 0.6 else self.paving() * 1.2
+        )
+        self.paint(line, colour, 9.0)
+
+    def terrace(self, centre: Points, angle: float) -> None:
+        """A paved or decked yard with things on it."""
+        length, width = self.px(3.0, 14.0), self.px(2.5, 8.0)
+        self.paint(rectangle(centre, length, width, angle), self.paving(), self.rng.uniform(2.0, 8.0))
+        for _ in range(self.rng.integers(0, 8)):
+            at = centre + self.rng.uniform(-0.45, 0.45, 2) * min(length, width)
+            thing = rectangle(at, self.px(0.4, 2.5), self.px(0.4, 1.8), self.rng.uniform(0.0, math.pi))
+            self.shade(thing, self.px(0.4, 1.2))
+            self.paint(
+                thing, self.rng.uniform(20.0, 240.0) * self.rng.uniform(0.85, 1.15, 3).astype(np.float32), 4.0
+            )
 
     def tree(self, centre: Points, radius: float) -> None:
         """A crown with its shadow; it may hang over a roof."""
@@ -218,6 +265,13 @@ def _roof_faces(length: float, width: float, kind: str) -> list[tuple[Points, Po
     return faces
 
 
+def _roof_colour(rng: np.random.Generator) -> Image:
+    """Of one roof."""
+    return ROOFS[rng.integers(len(ROOFS))] * rng.uniform(0.7, 1.25) + rng.uniform(-12, 12, 3).astype(
+        np.float32
+    )
+
+
 def building(canvas: Canvas, number: int, centre: Points, length: float, width: float, angle: float) -> bool:
     """Draw one building of one or two wings with its shadow; False where another stands."""
     rng = canvas.rng
@@ -238,19 +292,28 @@ def building(canvas: Canvas, number: int, centre: Points, length: float, width: 
     if not footprint.any() or (canvas.labels[footprint] > 0).mean() > 0.02:
         return False
     height = rng.uniform(2.5, 9.0) / canvas.gsd
+    wall = canvas.paving() * rng.uniform(0.8, 1.6)
     for wing in wings:
         canvas.shade(rectangle(*wing), height)
+    for wing in wings:  # the roof hides the foot of one wall, and shows that of the other
+        foot = rectangle(*wing)
+        hull = cv2.convexHull(np.vstack([foot, foot + canvas.light.lean * height]).astype(np.float32))[:, 0]
+        canvas.paint(hull.astype(np.float64), wall, 4.0)
     colour = ROOFS[rng.integers(len(ROOFS))] * rng.uniform(0.7, 1.25) + rng.uniform(-12, 12, 3).astype(
         np.float32
     )
     kind = str(rng.choice(("gable", "hip", "flat", "shed"), p=(0.45, 0.2, 0.25, 0.1)))
     stripes, amplitude = rng.uniform(0.25, 1.2) / canvas.gsd, rng.uniform(0.0, 0.12)
+    contrast = rng.uniform(0.2, 1.2) * (1.0 - canvas.light.shade)
+    colour = _roof_colour(rng)
     rows, columns = np.mgrid[: canvas.side, : canvas.side].astype(np.float32)
     for (at, long, wide, a), mask in zip(wings, masks, strict=True):
+        if rng.random() < 0.25:
+            colour = _roof_colour(rng)
         t = np.array([[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]])
         for face, downhill in _roof_faces(long, wide, kind):
             where = _inside(canvas.labels.shape, at + face @ t.T) & mask
-            lit = 1.0 - 0.35 * float((t @ downhill) @ canvas.light.away) * (1.0 - canvas.light.shade)
+            lit = max(0.3, 1.0 - contrast * float((t @ downhill) @ canvas.light.away))
             along = columns[where] * math.cos(a) + rows[where] * math.sin(a)
             ribs = 1.0 + amplitude * np.sin(along * (math.tau / max(stripes, 2.2)))
             canvas.rgb[where] = colour * lit * ribs[:, None] + canvas.fine[where] * rng.uniform(1.0, 8.0)
@@ -284,7 +347,10 @@ def annexes(canvas: Canvas, centre: Points, length: float, width: float, angle: 
         at = centre + across * side * (width + wide) / 2.0 + along * rng.uniform(-0.5, 0.5) * length
         if rng.random() < 0.5:
             at = centre + along * side * (length + long) / 2.0 + across * rng.uniform(-0.5, 0.5) * width
-        canvas.paint(rectangle(at, long, wide, angle), canvas.paving(), rng.uniform(2.0, 6.0))
+        if rng.random() < 0.4:
+            canvas.terrace(at, angle)
+        else:
+            canvas.paint(rectangle(at, long, wide, angle), canvas.paving(), rng.uniform(2.0, 6.0))
         if rng.random() < 0.3:
             canvas.car(at, angle + rng.choice((0.0, math.pi / 2.0)))
 
@@ -315,6 +381,9 @@ def render(side_px: int, gsd_m: float, rng: np.random.Generator) -> tuple[Image,
         plans += [(at + step * k, length, width * rng.uniform(0.85, 1.15), own) for k in range(row)]
     for plan in plans:
         annexes(canvas, *plan)
+    for thing, most in ((canvas.pool, 3), (canvas.hedge, 6), (canvas.terrace, 3)):
+        for _ in range(rng.integers(0, most)):
+            thing(canvas.place(), angle + rng.choice((0.0, math.pi / 2.0)))
     for plan in plans:
         number += building(canvas, number + 1, *plan)
     for _ in range(int(rng.exponential(6.0))):
@@ -332,14 +401,8 @@ def decoys(rgb: Image, labels: Labels, gsd_m: float, rng: np.random.Generator) -
     canvas.rgb, canvas.labels = rgb.copy(), labels
     angle = rng.uniform(0.0, math.pi)
     for _ in range(rng.integers(1, 5)):
-        if rng.random() < 0.4:
-            canvas.car_park(canvas.place(), angle)
-        else:
-            canvas.paint(
-                rectangle(canvas.place(), canvas.px(3, 20), canvas.px(2.5, 10), angle),
-                canvas.paving(),
-                rng.uniform(2, 7),
-            )
+        drawers = (canvas.yard, canvas.car_park, canvas.pool, canvas.terrace, canvas.hedge)
+        drawers[rng.integers(len(drawers))](canvas.place(), angle)
     for _ in range(rng.integers(0, 4)):
         canvas.car(canvas.place(), angle)
     return canvas.rgb

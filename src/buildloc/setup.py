@@ -42,6 +42,7 @@ setup(
         "pyarrow>=14,<30",
         "pyogrio>=0.10,<1",
         "PyYAML>=6,<7",
+        "matplotlib>=3.6,<4",
         "rosbags>=0.11,<0.12",
     ],
     extras_require={"ros": ["buildloc_msgs_py[ros]"], "test": ["pytest"]},

@@ -46,15 +46,21 @@ def tilt(roll_rad: float, pitch_rad: float) -> tuple[float, float, float, float]
 
 
 def shoot(
-    stamp: int, x: float, y: float, yaw: float, altitude: float = 60.0, attitude=LEVEL
+    stamp: int,
+    x: float,
+    y: float,
+    yaw: float,
+    altitude: float = 60.0,
+    attitude=LEVEL,
+    camera: CameraModel = CAMERA,
 ) -> tuple[Frame, Mask]:
     """Frame and mask of a camera at (x, y) whose image-right points to ``yaw``."""
     c, s = math.cos(yaw), math.sin(yaw)
     to_world = np.array([[c, -s, x], [s, c, y], [0, 0, 1.0]])
     to_pixel = np.array([[1 / GSD, 0, SIDE / 2 - 0.5], [0, -1 / GSD, SIDE / 2 - 0.5], [0, 0, 1.0]])
-    ray = camera_matrix(CAMERA) @ level_matrix(attitude).T @ np.diag([1.0, -1.0, altitude])
+    ray = camera_matrix(camera) @ level_matrix(attitude).T @ np.diag([1.0, -1.0, altitude])
     homography = to_pixel @ to_world @ np.linalg.inv(ray)
-    size, flags = (CAMERA.width, CAMERA.height), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    size, flags = (camera.width, camera.height), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     image = cv2.warpPerspective(WORLD, homography, size, flags=flags)
     pixels = (cv2.warpPerspective(WORLD_MASK, homography, size, flags=flags) > 127).astype(np.uint8) * 255
-    return Frame(stamp, "camera", image, CAMERA, altitude, attitude), Mask(stamp, "camera", pixels)
+    return Frame(stamp, "camera", image, camera, altitude, attitude), Mask(stamp, "camera", pixels)

@@ -276,21 +276,28 @@ def _map(args: argparse.Namespace) -> int:
     from buildloc_segmenter.config import SegmenterConfig
     from buildloc_segmenter.segmenter import Segmenter
 
+    from buildloc.map_picture import MapPicture
     from buildloc.mapfile import write_map, write_tum
     from buildloc.settings import MAPPER, SEGMENTER, config_of, load
 
     settings = load(args.config, [*_registration(args), *args.overrides])
     segmenter = Segmenter(config_of(settings, SEGMENTER, SegmenterConfig))
     mapper = Mapper(config_of(settings, MAPPER, MapperConfig))
-    update = None
+    update, picture, refused = None, MapPicture(), list[str]()
     for frame in _frames(args.bag):
-        if isinstance(frame, FrameFault):
+        if isinstance(frame, FrameFault) or (mask := segmenter.process(frame)) is None:
             continue
-        mask = segmenter.process(frame)
-        update = (mapper.add(frame, mask) if mask is not None else None) or update
+        if args.plot is not None:
+            picture.add(frame)
+        try:
+            update = mapper.add(frame, mask) or update
+        except BuildlocError as error:
+            refused.append(str(error))
         if update is not None:
             _progress(f"{len(update.keyframes)} keyframes, {len(update.local_map)} buildings")
     update = mapper.finish()
+    if refused:
+        print(f"warning: {len(refused)} keyframes were refused; the first: {refused[0]}", file=sys.stderr)
     if update is None:
         raise BuildlocError(f"{args.bag}: gave no map; no keyframe could be added")
     write_map(update.outlines, update.local_map, args.out)
@@ -298,6 +305,10 @@ def _map(args: argparse.Namespace) -> int:
     if args.trajectory is not None:
         write_tum(update.keyframes, args.trajectory)
         print(f"{args.trajectory}: {len(update.keyframes)} poses (TUM)")
+    if args.plot is not None:
+        drawn = args.out.with_suffix(".png") if args.plot is True else args.plot
+        picture.write(update, drawn, str(args.bag))
+        print(f"{drawn}: mosaic of {len(update.keyframes)} images, path, buildings, links")
     return 0
 
 
@@ -438,7 +449,7 @@ def parser() -> argparse.ArgumentParser:
             help="middle of the area; in the south write --center=-33.9,151.2",
         ),
         _argument("--radius-km", type=float, required=True, help="how far around the centre, km"),
-        _argument("--out", type=Path, required=True, help="folder for the files and their manifest"),
+        _argument("-o", "--out", type=Path, required=True, help="folder for the files and their manifest"),
         _argument("--index-url", help="Microsoft's dataset-links.csv, if it has moved or is mirrored"),
     )  # fmt: skip
     preset = _argument("--preset", help="parameters of the matcher: default or paper")
@@ -446,7 +457,7 @@ def parser() -> argparse.ArgumentParser:
         _command(
             refdb_commands, "build", "describe building footprints", _refdb_build,
             _argument("sources", type=Path, nargs="+", help="footprint files or folders, the best first"),
-            _argument("--out", type=Path, required=True, help="database to write"),
+            _argument("-o", "--out", type=Path, required=True, help="database to write"),
             _argument("--center", type=_location, metavar="LAT,LON", help="keep what lies around here"),
             _argument("--radius-km", type=float, help="how far around the centre, km"),
             _argument("--bbox", type=_box, metavar="WEST,SOUTH,EAST,NORTH", help="keep what lies here"),
@@ -466,8 +477,12 @@ def parser() -> argparse.ArgumentParser:
         ),
         _command(
             commands, "map", "map file and trajectory of a bag", _map, bag,
-            _argument("--out", type=Path, required=True, help="GeoJSON or GeoParquet, local metres"),
+            _argument("-o", "--out", type=Path, required=True, help="GeoJSON or GeoParquet, local metres"),
             _argument("--trajectory", type=Path, help="keyframe poses in TUM format"),
+            _argument(
+                "--plot", type=Path, nargs="?", const=True, metavar="FILE",
+                help="picture of the map (default: beside --out, .png)",
+            ),
             _argument("--registration", metavar="NAME", help="sift, xfeat, coarse_loftr or loftr"),
             _argument("--registration-model", type=Path, help="ONNX file of its weights; none for sift"),
         ),
@@ -483,13 +498,13 @@ def parser() -> argparse.ArgumentParser:
         _command(
             commands, "run", "fixes of a bag, offline and deterministic", _run, bag, database,
             preset,
-            _argument("--out", type=Path, help="JSON lines, one per keyframe"),
+            _argument("-o", "--out", type=Path, help="JSON lines, one per keyframe"),
         ),
         _command(
             commands, "replay", "play a bag into the live nodes", _replay, bag,
             _argument("--database", type=Path, help="reference database"),
             _argument("--rate", type=float, default=1.0, help="speed relative to the recording"),
-            _argument("--out", type=Path, help="JSON lines of what arrived on /buildloc/fix"),
+            _argument("-o", "--out", type=Path, help="JSON lines of what arrived on /buildloc/fix"),
             _argument("--no-nodes", action="store_true", help="the nodes run already, elsewhere"),
             preset,
         ),

@@ -29,7 +29,7 @@ from buildloc_msgs_py.types import ByteArray, Fix, FloatArray, Frame
 from buildloc_segmenter.config import SegmenterConfig
 from buildloc_segmenter.segmenter import Segmenter
 
-from buildloc_eval.camera import photograph
+from buildloc_eval.camera import look
 from buildloc_eval.flight import FlightConfig, fly
 from buildloc_eval.flights import LiveFlight, evaluate_live
 from buildloc_eval.html import write_report
@@ -82,10 +82,8 @@ def make_bag(case: Case, ground: Ground, bag: Path, seed: int) -> None:
 def _label_mask(labels: OrthoWorld, frame: Frame, truth: Truth) -> ByteArray:
     """True building mask of a frame: the labels photographed from the same place, without noise."""
     pose = truth.poses[frame.stamp_ns]
-    clean = FlightConfig(exposure=0.0, blur_px=0.0, noise=0.0)
     place = (pose.x_m, pose.y_m, pose.altitude_m, pose.yaw_rad)
-    rng = np.random.default_rng(0)
-    seen = photograph(labels, frame.camera, place, frame.attitude_xyzw, clean, rng)
+    seen = look(labels, frame.camera, place, frame.attitude_xyzw)
     return np.asarray(seen[:, :, 0] > 127, dtype=np.uint8)
 
 

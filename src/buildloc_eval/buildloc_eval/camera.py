@@ -41,22 +41,17 @@ def level_to_world(x_m: float, y_m: float, yaw_rad: float) -> FloatArray:
 
 
 def world_to_rays(pose: tuple[float, float, float, float], attitude_xyzw: Quaternion) -> FloatArray:
-    """(3, 3) from (x, y, 1), metres of the world, to a ray in camera axes; ``pose`` as in photograph."""
+    """(3, 3) from (x, y, 1), metres of the world, to a ray in camera axes; ``pose`` as in :func:`look`."""
     x, y, altitude, yaw = pose
     return np.asarray(
         level_to_ray(altitude, attitude_xyzw) @ np.linalg.inv(level_to_world(x, y, yaw)), dtype=np.float64
     )
 
 
-def photograph(
-    world: Surface,
-    camera: CameraModel,
-    pose: tuple[float, float, float, float],
-    attitude_xyzw: Quaternion,
-    config: FlightConfig,
-    rng: np.random.Generator,
+def look(
+    world: Surface, camera: CameraModel, pose: tuple[float, float, float, float], attitude_xyzw: Quaternion
 ) -> ByteArray:
-    """(H, W, 3) BGR from ``pose`` (x, y, altitude in metres, ENU yaw of image-right).
+    """The world as it is, (H, W) or (H, W, 3), from ``pose``: x, y, altitude in m, ENU yaw of image-right.
 
     Raises WorldError when the image would reach beyond the bounds of the world.
     """
@@ -82,10 +77,23 @@ def photograph(
     rays = camera_matrix(camera) @ level_to_ray(altitude, attitude_xyzw)
     homography = to_window @ level_to_world(0.0, 0.0, yaw) @ np.linalg.inv(rays)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    image = cv2.warpPerspective(window.image_bgr, homography, (camera.width, camera.height), flags=flags)
+    seen = cv2.warpPerspective(window.image_bgr, homography, (camera.width, camera.height), flags=flags)
+    return np.asarray(seen, dtype=np.uint8)
+
+
+def photograph(
+    world: Surface,
+    camera: CameraModel,
+    pose: tuple[float, float, float, float],
+    attitude_xyzw: Quaternion,
+    config: FlightConfig,
+    rng: np.random.Generator,
+) -> ByteArray:
+    """What :func:`look` sees, (H, W, 3) BGR, with the blur, exposure and noise of a camera."""
+    image = look(world, camera, pose, attitude_xyzw)
     sigma = rng.uniform(0.0, config.blur_px)
     if sigma > 0.1:
-        image = cv2.GaussianBlur(image, (0, 0), sigma)
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), dtype=np.uint8)
     gain = max(0.2, 1.0 + config.exposure * rng.normal())
     grainy = image.astype(np.float32) * np.float32(gain)
     grainy += rng.standard_normal(image.shape, dtype=np.float32) * np.float32(config.noise)

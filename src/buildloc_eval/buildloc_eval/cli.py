@@ -60,7 +60,7 @@ def _progress(done: int, total: int) -> None:
 
 def add_sim_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `buildloc sim`; every field of FlightConfig is one."""
-    parser.add_argument("--out", type=Path, required=True, help="bag folder to write")
+    parser.add_argument("-o", "--out", type=Path, required=True, help="bag folder to write")
     world = parser.add_mutually_exclusive_group(required=True)
     world.add_argument("--ortho", type=Path, help="orthophoto to cut the flight out of (with --georef)")
     world.add_argument("--world", type=Path, help="GeoJSON of footprints to render the flight over")
@@ -119,7 +119,7 @@ def add_demo_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bag", type=Path, default=Path("bags/sample"), help="bag with ground truth")
     parser.add_argument("--footprints", type=Path, default=Path("bags/sample_footprints.geojson"))
     parser.add_argument("--rate", type=float, default=DEMO_RATE, help="speed relative to the recording")
-    parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder for what is made")
+    parser.add_argument("-o", "--out", type=Path, default=Path("out/demo"), help="folder for what is made")
 
 
 def run_demo(args: argparse.Namespace) -> int:
@@ -154,7 +154,9 @@ def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "name", choices=["barnarp", "mapping", "scale", "segmentation"], help="which evaluation"
     )
-    parser.add_argument("--out", type=Path, required=True, help="folder for report.json and report.html")
+    parser.add_argument(
+        "-o", "--out", type=Path, required=True, help="folder for report.json and report.html"
+    )
     parser.add_argument("--seed", type=int, default=1, help="seed of everything random")
     parser.add_argument("--quick", action="store_true", help="a part of it, in less than five minutes")
     parser.add_argument_group("eval scale").add_argument(

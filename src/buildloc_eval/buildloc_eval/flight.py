@@ -13,6 +13,10 @@ from buildloc_msgs_py.types import FloatArray
 Box = tuple[float, float, float, float]
 HORIZON_RAD = math.radians(80.0)
 MIN_STATES = 10
+TOUR_LEG_M = (200.0, 500.0)
+TOUR_TURN_RAD = math.radians(120.0)
+TOUR_EXCESS = 1.25
+TOUR_TRIES = 1000
 START_NS = 1_760_000_000 * 10**9
 
 
@@ -81,18 +85,24 @@ def margin_m(config: FlightConfig) -> float:
     return (config.altitude_m + config.altitude_swing_m) * math.tan(angle)
 
 
+def _inner(box_m: Box, config: FlightConfig) -> tuple[FloatArray, FloatArray]:
+    """Corners (2,) of what is left of the box where the camera never sees beyond it."""
+    margin = margin_m(config)
+    low, high = np.array(box_m[:2]) + margin, np.array(box_m[2:]) - margin
+    if high[0] - low[0] < 20.0 or high[1] - low[1] < 1.0:
+        raise FlightError(
+            f"the region is too small for this camera: an image reaches {margin:.0f} m from the drone; "
+            "fly lower, narrow the field of view or enlarge the region"
+        )
+    return low, high
+
+
 def legs(box_m: Box, config: FlightConfig) -> FloatArray:
     """(N, 2) corners of back-and-forth legs inside the box, along its longer side, until the length is flown.
 
     Raises FlightError when the box is too small.
     """
-    margin = margin_m(config)
-    west, south, east, north = box_m[0] + margin, box_m[1] + margin, box_m[2] - margin, box_m[3] - margin
-    if east - west < 20.0 or north - south < 1.0:
-        raise FlightError(
-            f"the region is too small for this camera: an image reaches {margin:.0f} m from the drone; "
-            "fly lower, narrow the field of view or enlarge the region"
-        )
+    (west, south), (east, north) = _inner(box_m, config)
     swap = north - south > east - west
     width, height = (north - south, east - west) if swap else (east - west, north - south)
     leg = min(config.leg_m, width)
@@ -112,10 +122,51 @@ def legs(box_m: Box, config: FlightConfig) -> FloatArray:
     return np.asarray((uv[:, ::-1] if swap else uv) + (west, south), dtype=np.float64)
 
 
-def fly(box_m: Box, config: FlightConfig, seed: int) -> Trajectory:
-    """The flight at ten states per second, reproducible by its seed.
+def tour(box_m: Box, config: FlightConfig, seed: int) -> FloatArray:
+    """(N, 2) corners of a round trip inside the box: legs of ``TOUR_LEG_M`` that turn by ``TOUR_TURN_RAD`` at
+    most, drawn until they and the way back to the start make ``length_m``, ``TOUR_EXCESS`` of it at most.
 
-    Raises FlightError when it does not fit the box, touches the ground or is too short to be one.
+    Raises FlightError when the box is too small.
+    """
+    low, high = _inner(box_m, config)
+    rng = np.random.default_rng([seed, 2])
+    for _ in range(TOUR_TRIES):
+        corners, flown = [rng.uniform(low, high)], 0.0
+        for _ in range(TOUR_TRIES):
+            corner = rng.uniform(low, high)
+            leg, back = (math.dist(corner, other) for other in (corners[-1], corners[0]))
+            if not TOUR_LEG_M[0] <= leg <= TOUR_LEG_M[1] or _turn(*corners[-2:], corner) > TOUR_TURN_RAD:
+                continue
+            corners.append(corner)
+            flown += leg
+            if flown + back >= config.length_m:
+                break
+        closed = np.array([*corners, corners[0]])
+        length = flown + math.dist(corners[-1], corners[0])
+        wanted = config.length_m <= length <= TOUR_EXCESS * config.length_m
+        if wanted and _turn(*closed[-3:]) <= TOUR_TURN_RAD:
+            return closed
+    raise FlightError(f"no round trip of {config.length_m:g} m fits the region; fly further or nearer")
+
+
+def _turn(*corners: FloatArray) -> float:
+    """Angle between the two legs of three corners, rad; of fewer, none."""
+    if len(corners) < 3:
+        return 0.0
+    (ax, ay), (bx, by) = np.diff(corners, axis=0)
+    return abs(math.atan2(ax * by - ay * bx, ax * bx + ay * by))
+
+
+def fly(box_m: Box, config: FlightConfig, seed: int) -> Trajectory:
+    """The flight along :func:`legs`. Raises FlightError when they do not fit, and as :func:`follow`."""
+    return follow(legs(box_m, config), config.length_m, config, seed)
+
+
+def follow(corners: FloatArray, length_m: float, config: FlightConfig, seed: int) -> Trajectory:
+    """The flight from corner to corner (N, 2), ``length_m`` of it at most, at ten states per second,
+    reproducible by its seed.
+
+    Raises FlightError when it touches the ground or is too short to be one.
     """
     if config.altitude_swing_m >= config.altitude_m:
         raise FlightError(
@@ -123,9 +174,8 @@ def fly(box_m: Box, config: FlightConfig, seed: int) -> Trajectory:
             f"{config.altitude_m:g}; fly higher or swing less"
         )
     rng = np.random.default_rng(seed)
-    corners = legs(box_m, config)
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(corners, axis=0).T))])
-    length = min(config.length_m, float(along[-1]))
+    length = min(length_m, float(along[-1]))
     seconds = np.arange(0.0, length / config.speed_mps, 0.1)
     if len(seconds) < MIN_STATES:
         raise FlightError(

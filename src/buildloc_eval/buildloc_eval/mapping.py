@@ -1,7 +1,7 @@
-"""How metric the mapper's registration and trajectory are, on real flights with measured positions.
+"""How metric the map is over a whole flight: registration, trajectory, buildings, rate and memory.
 
-Every method of registration over consecutive images, the whole trajectory through the mapper, and beside
-it plain consecutive chaining: no rectification, no refinement by the graph.
+Real flights with measured positions, flights cut out of real orthophotos with exact truth, and beside every
+figure the same with plain consecutive chaining: no rectification, no pose graph.
 """
 
 from __future__ import annotations
@@ -10,354 +10,332 @@ import dataclasses
 import json
 import math
 import time
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
+import shapely
+from buildloc.map_picture import MapPicture
 from buildloc_mapper.config import MapperConfig
-from buildloc_mapper.mapper import ORIGIN, Mapper
-from buildloc_mapper.registration import Link, Registration
+from buildloc_mapper.extraction import Extractor
+from buildloc_mapper.fusion import Fusion, View
+from buildloc_mapper.mapper import MapUpdate
 from buildloc_mapper.similarity import Similarity
-from buildloc_msgs_py.types import FloatArray, Frame, Mask
-from evo.core.metrics import APE, PoseRelation
-from evo.core.trajectory import PosePath3D
+from buildloc_msgs_py.types import FloatArray, LocalMap
 
+from buildloc_eval import endurance
+from buildloc_eval.cut import CutFlight, cut
+from buildloc_eval.flight import FlightConfig, follow, tour
+from buildloc_eval.flown import Aligned, Flight, Path2d, align, draw, mapped, unrectified
 from buildloc_eval.html import write_report
 from buildloc_eval.machine import machine
+from buildloc_eval.orthos import LabelledGround, banepa, barnarp
+from buildloc_eval.pairs import chain, links, pair_scores
 from buildloc_eval.realworld import data_folder
-from buildloc_eval.survey import LEVEL, Survey, mirafiori, sheffield
+from buildloc_eval.sections import PICTURES, Scores, Sections, fingerprint
+from buildloc_eval.survey import mirafiori, sheffield
 
-NETWORKS = ("xfeat", "coarse_loftr")
-COARSE_MAP_GSD_M = 2.0  # no buildings are mapped here: the masks are empty
-QUICK_IMAGES = 60
-BARS = {
-    "mirafiori_pairs": 31,
-    "mirafiori_translation_median_m": 0.12,
-    "mirafiori_translation_p90_m": 0.2,
-    "mirafiori_yaw_median_deg": 0.1,
-    "mirafiori_trajectory_rmse_m": 0.3,
-    "sheffield_images_in_one_map": 172,  # all; fewer in a quick run
-    "sheffield_trajectory_rmse_m": 3.0,
-}
-OF_PAIRS = (
-    "pairs_registered",
-    "translation_median_m",
-    "translation_p90_m",
-    "yaw_median_deg",
-    "yaw_p90_deg",
-)
 Progress = Callable[[str], None]
+Make = Callable[[], Scores]
+NETWORKS = ("xfeat", "coarse_loftr")
+MAPPED_BY = ("sift", "xfeat")  # coarse_loftr gives the same pairs, and would take as long as the two
+COARSE_MAP_GSD_M = 2.0  # for flights whose masks are empty
+TOUR = FlightConfig(length_m=2000.0, speed_mps=5.0, altitude_swing_m=10.5, tilt_deg=3.0)
+BIAS = 1.03
+QUICK_IMAGES = 60
+KEYFRAMES, QUICK_KEYFRAMES = 1000, 150
+CODE = ("buildloc_eval", "buildloc_mapper", "buildloc_msgs_py")
+IMAGERY = {
+    "mirafiori_rtk": "real images; RTK positions and gimbal angles of their own metadata",
+    "sheffield_flight": "real images; EXIF positions; the tilt is estimated from the images",
+    "barnarp, banepa_ortho, altitude_bias, endurance": (
+        "real orthophotos, photographed along simulated paths through a simulated camera; masks are the true "
+        "outlines seen by that camera, so that mapping is measured alone; banepa_ortho is labelled in its "
+        "middle only; endurance flies over barnarp and its mirror images"
+    ),
+}
 
 
 @dataclass(frozen=True)
-class Path2d:
-    """Poses (N,) of images ``index`` (N,) in the frame of the first, and what happened on the way."""
+class Bar:
+    """What must be reached: a figure of a section by its path, at least or at most."""
 
-    index: tuple[int, ...]
-    poses: tuple[Similarity, ...]
-    counts: dict[str, float]
+    section: str
+    figure: str
+    limit: float
+    at_least: bool = False
+
+    def judge(self, sections: dict[str, Scores]) -> dict[str, Any] | None:
+        """Limit, measured, held; None when the section was not run."""
+        if self.section not in sections:
+            return None
+        value: Any = sections[self.section]
+        for part in self.figure.split("."):
+            value = value.get(part) if isinstance(value, dict) else None
+        held = value is not None and (value >= self.limit if self.at_least else value <= self.limit)
+        return {"at least" if self.at_least else "at most": self.limit, "measured": value, "held": held}
+
+
+BARS = (
+    Bar("mirafiori_rtk_sift", "pairs.pairs_registered", 31, at_least=True),
+    Bar("mirafiori_rtk_sift", "pairs.translation_median_m", 0.12),
+    Bar("mirafiori_rtk_sift", "pairs.translation_p90_m", 0.2),
+    Bar("mirafiori_rtk_sift", "pairs.yaw_median_deg", 0.1),
+    Bar("mirafiori_rtk_sift", "mapper.rmse_m", 0.3),
+    Bar("sheffield_flight_sift", "mapper.share_of_images", 1.0, at_least=True),
+    Bar("sheffield_flight_sift", "mapper.rmse_m", 3.0),
+    *(
+        bar
+        for flight in ("barnarp", "banepa_ortho")
+        for bar in (
+            Bar(flight, "without_loop_closures.rmse_percent", 1.0),
+            Bar(flight, "mapper.rmse_m", 2.0),
+            Bar(flight, "mapper.buildings.median_m", 1.0),
+        )
+    ),
+    Bar("altitude_bias", "scale_error_percent", 0.5),
+    Bar("altitude_bias", "scale_in_sigmas", 2.0),
+    Bar("endurance", "median_ms", 250.0),
+    Bar("endurance", "last_over_first", 1.25),
+    Bar("endurance", "peak_memory_mb", 1000.0),
+)
 
 
 def configs(data: Path) -> dict[str, MapperConfig]:
     """The mapper's config for every method whose weights are here."""
-    found = {"sift": replace(MapperConfig(), map_gsd_m=COARSE_MAP_GSD_M)}
+    found = {"sift": MapperConfig()}
     for name in NETWORKS:
         weights = data / "models" / f"{name}.onnx"
         if weights.is_file():
-            found[name] = replace(found["sift"], registration=name, registration_model=str(weights))
+            found[name] = replace(MapperConfig(), registration=name, registration_model=str(weights))
     return found
 
 
-def unrectified(frame: Frame) -> Frame:
-    """The frame as if its camera had no lens errors and looked straight down."""
-    return replace(frame, camera=replace(frame.camera, distortion=()), attitude_xyzw=LEVEL)
+def building_scores(local_map: LocalMap, to_world: Similarity, true_m: FloatArray) -> Scores:
+    """Distances of the buildings that were seen whole, placed by the alignment of the trajectory, to the
+    nearest true centroids (N, 2)."""
+    placed = to_world.apply(local_map.select(~local_map.cut).centroids_m)
+    if not len(placed):
+        return {"buildings": 0}
+    distances = np.linalg.norm(placed[:, None] - true_m[None], axis=2).min(axis=1)
+    return {
+        "buildings": len(placed),
+        "median_m": float(np.median(distances)),
+        "p90_m": float(np.quantile(distances, 0.9)),
+    }
 
 
-def links(
-    survey: Survey, config: MapperConfig, seen: Callable[[Frame], Frame]
-) -> tuple[list[Link | None], dict[str, float]]:
-    """Registration of every image in the one before it; None where it was rejected, counted by reason."""
-    registration, rejected = Registration(config), Counter[str]()
-    found: list[Link | None] = []
-    prepare_s = register_s = 0.0
-    before = None
-    for index in range(len(survey)):
-        frame = seen(survey.frame(index))
-        started = time.perf_counter()
-        now = registration.prepare(frame)
-        prepare_s += time.perf_counter() - started
-        if before is not None:
-            started = time.perf_counter()
-            answer = registration.register(before, now)
-            register_s += time.perf_counter() - started
-            found.append(answer if isinstance(answer, Link) else None)
-            if not isinstance(answer, Link):
-                rejected[f"rejected_{answer.reason}"] += 1
-        before = now
-    seconds = {
-        "prepare_ms": 1e3 * prepare_s / len(survey), "register_ms": 1e3 * register_s / max(1, len(found))
-    }  # fmt: skip
-    return found, {**rejected, **seconds}
-
-
-def _rotation(yaw_rad: float) -> FloatArray:
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    return np.array([[c, -s], [s, c]])
+def plain_map(flight: Flight, path: Path2d, config: MapperConfig) -> LocalMap:
+    """The masks fused at the poses of plain chaining, as if the camera had looked straight down."""
+    fusion = Fusion(config)
+    views = {i: View.of(unrectified(flight.frame(i)), flight.mask(i), config) for i in path.index}
+    dirty = fusion.update(views, dict(zip(path.index, path.poses, strict=True)), everything=True)
+    return Extractor(config).update(fusion, dirty, 0).local_map
 
 
 @dataclass(frozen=True)
-class Constants:
-    """What the truth says is constantly wrong with what the mapper is told: the height above ground by a
-    factor, the gimbal's heading by an angle, the camera's axis by an offset (right, up) on the ground."""
+class Flown:
+    """What a flight gave: scores and alignment by way of mapping, the mapper's path and its map."""
 
-    height_factor: float
-    heading_rad: float
-    axis_m: FloatArray
-
-    def correct(self, flown: Path2d) -> Path2d:
-        """The path with height and axis put right; its heading is arbitrary anyway."""
-        poses = []
-        for pose in flown.poses:
-            x, y = self.height_factor * np.array(pose[:2]) + _rotation(pose.yaw_rad) @ self.axis_m
-            poses.append(pose._replace(x_m=float(x), y_m=float(y)))
-        return Path2d(flown.index, tuple(poses), {})
+    scores: Scores
+    aligned: dict[str, Aligned]
+    path: Path2d
+    update: MapUpdate | None
 
 
-def pair_scores(
-    survey: Survey, yaw_rad: FloatArray, found: list[Link | None]
-) -> tuple[dict[str, Any], Constants]:
-    """Errors of consecutive images against truth, and the constants that explain most of them.
-
-    The figures are of what registration and telemetry say. Those under ``fitted_to_truth`` are what is left
-    once the constants are taken out: they tell what stands in the way, not what is reached.
-    """
-    told, true, turned, yaw_deg = [], [], [], []
-    for index, link in enumerate(found):
-        if link is None:
-            continue
-        to_world, after = _rotation(yaw_rad[index]), _rotation(yaw_rad[index + 1])
-        told.append(to_world @ link.transform[:2])
-        true.append(survey.true_m[index + 1] - survey.true_m[index])
-        turned.append(after - to_world)
-        error = link.transform.yaw_rad - (yaw_rad[index + 1] - yaw_rad[index])
-        yaw_deg.append(abs(math.degrees(math.remainder(error, math.tau))))
-    errors = np.linalg.norm(np.subtract(told, true), axis=1)
-    design = np.concatenate(
-        [np.column_stack([t, _rotation(math.pi / 2) @ t, a]) for t, a in zip(told, turned, strict=True)]
-    )
-    a, b, *offset = solution = np.linalg.lstsq(design, np.concatenate(true), rcond=None)[0]
-    heading = math.atan2(b, a)
-    constants = Constants(math.hypot(a, b), heading, _rotation(-heading) @ np.array(offset))
-    left = np.linalg.norm((design @ solution - np.concatenate(true)).reshape(-1, 2), axis=1)
-    scores = {
-        "pairs": len(found),
-        "pairs_registered": len(errors),
-        "translation_median_m": float(np.median(errors)),
-        "translation_p90_m": float(np.quantile(errors, 0.9)),
-        "yaw_median_deg": float(np.median(yaw_deg)),
-        "yaw_p90_deg": float(np.quantile(yaw_deg, 0.9)),
-        "fitted_to_truth": {
-            "height_factor": constants.height_factor,
-            "heading_deg": math.degrees(heading),
-            "axis_right_m": float(constants.axis_m[0]),
-            "axis_up_m": float(constants.axis_m[1]),
-            "translation_median_m": float(np.median(left)),
-            "translation_p90_m": float(np.quantile(left, 0.9)),
-        },
-    }
-    return scores, constants
-
-
-def chain(found: list[Link | None]) -> Path2d:
-    """Consecutive links, one after the other, up to the first that is missing."""
-    poses = [ORIGIN]
-    for link in found:
-        if link is None:
-            break
-        poses.append(poses[-1].compose(link.transform))
-    return Path2d(tuple(range(len(poses))), tuple(poses), {})
-
-
-def mapped(survey: Survey, config: MapperConfig) -> Path2d:
-    """The flight through the mapper, with empty masks: registration, loop closures and pose graph."""
-    mapper, update, started = Mapper(config), None, time.perf_counter()
-    empty = np.zeros((survey.camera.height, survey.camera.width), dtype=np.uint8)
-    for index in range(len(survey)):
-        frame = survey.frame(index)
-        update = mapper.add(frame, Mask(frame.stamp_ns, frame.frame_id, empty)) or update
+def _fly(
+    flight: Flight, config: MapperConfig, others: dict[str, Path2d], folder: Path, with_scale: bool = False
+) -> Flown:
+    """A flight through the mapper, beside paths of other ways to map it; two pictures."""
+    picture = MapPicture()
+    path, update = mapped(flight, config, picture)
+    paths = {"mapper": path, **others}
+    aligned = {name: found for name, path in paths.items() if (found := align(flight, path, with_scale))}
+    scores: Scores = {name: found.scores for name, found in aligned.items()}
     if update is None:
-        return Path2d((), (), {})
-    kept = ("loop_closures", "restarts")
-    counts = {k: v for k, v in update.funnel.items() if k in kept or k.startswith("rejected_")}
-    counts["seconds_per_image"] = (time.perf_counter() - started) / len(survey)
-    return Path2d(
-        tuple(k.stamp_ns // 1_000_000_000 for k in update.keyframes),
-        tuple(Similarity(k.x_m, k.y_m, k.yaw_rad, k.scale) for k in update.keyframes),
-        counts,
-    )
+        return Flown(scores, aligned, path, update)
+    name, alignment = f"{flight.name}_{config.registration}", "similarity" if with_scale else "rigid"
+    draw(folder / f"{name}_path.png", flight, aligned, f"{flight.name}: {alignment} alignment to the truth")
+    picture.write(update, folder / f"{name}_map.png", f"{flight.name}: the map as the graph has it")
+    scores[PICTURES] = [
+        (f"{flight.name}, {config.registration}: paths", f"{name}_path.png"),
+        (f"{flight.name}, {config.registration}: mosaic, path, buildings, loop closures", f"{name}_map.png"),
+    ]
+    return Flown(scores, aligned, path, update)
 
 
-def _evo_path(places_m: FloatArray, yaw_rad: FloatArray) -> PosePath3D:
-    """(N, 2) places and (N,) yaws in the plane as evo takes them."""
-    half, none = yaw_rad / 2.0, np.zeros(len(yaw_rad))
-    return PosePath3D(
-        positions_xyz=np.column_stack([places_m, none]),
-        orientations_quat_wxyz=np.column_stack([np.cos(half), none, none, np.sin(half)]),
-    )
+def rtk_scores(data: Path, config: MapperConfig, folder: Path) -> Scores:
+    """Pairs of mirafiori_rtk, and its trajectory for the methods that are flown."""
+    survey = mirafiori(data)
+    assert survey.yaw_rad is not None
+    found, counts = links(survey, config, lambda frame: frame)
+    pairs, constants = pair_scores(survey, survey.yaw_rad, found)
+    plain, _ = links(survey, config, unrectified)
+    plain_pairs, _ = pair_scores(survey, survey.yaw_rad, plain)
+    scores: Scores = {"pairs": {**pairs, **counts}, "plain_pairs": plain_pairs}
+    if config.registration not in MAPPED_BY:
+        return scores
+    flat = replace(config, map_gsd_m=COARSE_MAP_GSD_M)
+    flown = _fly(survey, flat, {"plain_chaining": chain(plain)}, folder)
+    put_right = align(survey, constants.correct(flown.path), with_scale=False)
+    if put_right is not None:
+        flown.scores["fitted_to_truth"] = put_right.scores
+    return {**scores, **flown.scores}
 
 
-def trajectory_scores(survey: Survey, flown: Path2d, with_scale: bool) -> tuple[dict[str, Any], FloatArray]:
-    """Evo's absolute position error after alignment, and the aligned places (N, 2)."""
-    if len(flown.index) < 3:
-        return {"images": len(flown.index)}, np.empty((0, 2))
-    places = np.array([pose[:2] for pose in flown.poses])
-    estimate = _evo_path(places, np.array([pose.yaw_rad for pose in flown.poses]))
-    reference = _evo_path(survey.true_m[list(flown.index)], np.zeros(len(flown.index)))
-    _, _, scale = estimate.align(reference, correct_scale=with_scale)
-    metric = APE(PoseRelation.translation_part)
-    metric.process_data((reference, estimate))
-    scores: dict[str, Any] = {
-        "images": len(flown.index), "of": len(survey),
-        **{f"{name}_m": float(metric.get_all_statistics()[name]) for name in ("rmse", "median", "max")},
-        **flown.counts,
+def tilted_scores(data: Path, config: MapperConfig, folder: Path, images: int | None) -> Scores:
+    """The trajectory of sheffield_flight, or of its first images."""
+    survey = sheffield(data, images)
+    plain, _ = links(survey, config, unrectified)
+    flat = replace(config, map_gsd_m=COARSE_MAP_GSD_M)
+    return _fly(survey, flat, {"plain_chaining": chain(plain)}, folder, with_scale=True).scores
+
+
+def cut_flight(ground: LabelledGround, seed: int, altitude_factor: float = 1.0) -> CutFlight:
+    """A round trip over an orthophoto."""
+    path = tour(ground.flown_m(), TOUR, seed)
+    trajectory = follow(path, math.inf, TOUR, seed)
+    return cut(ground.name, ground.picture, ground.labels, trajectory, TOUR, seed, altitude_factor)
+
+
+def cut_scores(ground: LabelledGround, config: MapperConfig, folder: Path, seed: int) -> Scores:
+    """Trajectory and buildings of a flight over an orthophoto."""
+    flight = cut_flight(ground, seed)
+    found, _ = links(flight, config, unrectified)
+    plain, (without, _) = chain(found), mapped(flight, replace(config, loop_tests=0))
+    others = {"without_loop_closures": without, "plain_chaining": plain}
+    flown = _fly(flight, config, others, folder)
+    true = shapely.get_coordinates(shapely.centroid(ground.buildings))
+    maps = {"plain_chaining": plain_map(flight, plain, config)}
+    if flown.update is not None:
+        maps["mapper"] = flown.update.local_map
+    for way, aligned in flown.aligned.items():
+        if way in maps:
+            flown.scores[way]["buildings"] = building_scores(maps[way], aligned.to_world, true)
+    return flown.scores
+
+
+def bias_scores(ground: LabelledGround, config: MapperConfig, seed: int) -> Scores:
+    """The same flight with an altimeter that says too much: the map is as much too large, and the standard
+    deviation that it tells of its scale allows for it."""
+    path, update = mapped(cut_flight(ground, seed, BIAS), config)
+    aligned = align(cut_flight(ground, seed), path, with_scale=True)
+    if update is None or aligned is None:
+        return {}
+    larger, sigma = 1.0 / aligned.scores["scale"], update.funnel["scale_sigma"]
+    return {
+        "altitude_told_over_true": BIAS, "map_over_world": larger,
+        "scale_error_percent": 100.0 * abs(larger / BIAS - 1.0),
+        "scale_sigma_told": sigma, "scale_in_sigmas": abs(math.log(larger)) / sigma,
+        "similarity_alignment": aligned.scores,
     }  # fmt: skip
-    if with_scale:
-        scores["scale_of_alignment"] = float(scale)
-    return scores, np.asarray(estimate.positions_xyz[:, :2], dtype=np.float64)
 
 
-def draw(path: Path, survey: Survey, aligned: dict[str, FloatArray], title: str) -> None:
-    """True path and aligned paths, east and north in metres."""
-    figure, axes = plt.subplots(figsize=(9, 7))
-    axes.plot(*survey.true_m.T, "k.-", lw=2.0, ms=4, label="measured")
-    for name, places in aligned.items():
-        axes.plot(*places.T, "-", lw=1.2, label=name)
-    axes.set_aspect("equal")
-    axes.set_xlabel("east, m")
-    axes.set_ylabel("north, m")
-    axes.set_title(title)
-    axes.legend(fontsize=8)
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+def endurance_scores(
+    ground: LabelledGround, config: MapperConfig, folder: Path, seed: int, keyframes: int, progress: Progress
+) -> Scores:
+    """Cost of a keyframe over a long flight, and how far it is from the truth at its end."""
+    flight = endurance.long_flight(ground, keyframes, seed)
+    load = endurance.endure(flight, config, progress)
+    endurance.draw(load, folder / "endurance.png")
+    return {**endurance.scores(flight, load), PICTURES: [("endurance: cost of a keyframe", "endurance.png")]}
 
 
-def _flight(
-    survey: Survey,
-    methods: dict[str, MapperConfig],
-    with_scale: bool,
-    mapped_by: set[str],
-    progress: Progress,
-) -> tuple[dict[str, Any], dict[str, FloatArray]]:
-    """Scores of a flight by method, and the aligned paths to draw."""
-    results: dict[str, Any] = {"images": len(survey)}
-    drawn: dict[str, FloatArray] = {}
-    for name, config in methods.items():
-        progress(f"{survey.name}: {name}")
-        scores: dict[str, Any] = {}
-        constants = None
-        if survey.yaw_rad is not None:
-            found, counts = links(survey, config, lambda frame: frame)
-            pairs, constants = pair_scores(survey, survey.yaw_rad, found)
-            scores["pairs"] = {**pairs, **counts}
-        if name in mapped_by:
-            flown = mapped(survey, config)
-            scores["mapper"], drawn[f"mapper, {name}"] = trajectory_scores(survey, flown, with_scale)
-            if constants is not None:
-                left, _ = trajectory_scores(survey, constants.correct(flown), with_scale)
-                scores["mapper"]["fitted_to_truth"] = left
-            plain, _ = links(survey, config, unrectified)
-            chained, drawn[f"plain chaining, {name}"] = trajectory_scores(survey, chain(plain), with_scale)
-            scores["plain_chaining"] = chained
-            if survey.yaw_rad is not None:
-                scores["plain_pairs"], _ = pair_scores(survey, survey.yaw_rad, plain)
-        results[name] = scores
-    return results, drawn
-
-
-def table(flights: dict[str, dict[str, Any]]) -> str:
-    """One line per flight and method."""
-    head = (
-        "flight", "method", "pairs", "trans med", "p90 m", "yaw med", "p90 deg", "map rmse m", "images",
-        "plain rmse m", "images",
-    )  # fmt: skip
-    lines: list[tuple[str, ...]] = [head]
-    for flight, results in flights.items():
-        for method, scores in results.items():
-            if not isinstance(scores, dict):
-                continue
-            pairs, flown, plain = (scores.get(k, {}) for k in ("pairs", "mapper", "plain_chaining"))
-            figures = [pairs.get(name) for name in OF_PAIRS]
-            figures += [path.get(name) for path in (flown, plain) for name in ("rmse_m", "images")]
-            shown = ["-" if v is None else f"{v:.3f}" if isinstance(v, float) else str(v) for v in figures]
-            lines.append((flight, method, *shown))
-    widths = [max(len(row[i]) for row in lines) for i in range(len(head))]
-    return "\n".join("  ".join(f"{cell:>{w}}" for cell, w in zip(row, widths, strict=True)) for row in lines)
-
-
-def reached(flights: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """The bars of the default method: wanted, measured, whether it holds."""
-    rtk, tilted = flights["mirafiori_rtk"]["sift"], flights["sheffield_flight"]["sift"]
-    one_map = tilted["mapper"]["images"] if not tilted["mapper"].get("restarts") else 0
-    measured = {
-        "mirafiori_pairs": rtk["pairs"]["pairs_registered"],
-        "mirafiori_translation_median_m": rtk["pairs"]["translation_median_m"],
-        "mirafiori_translation_p90_m": rtk["pairs"]["translation_p90_m"],
-        "mirafiori_yaw_median_deg": rtk["pairs"]["yaw_median_deg"],
-        "mirafiori_trajectory_rmse_m": rtk["mapper"].get("rmse_m"),
-        "sheffield_images_in_one_map": one_map,
-        "sheffield_trajectory_rmse_m": tilted["mapper"].get("rmse_m"),
+def plan(data: Path, folder: Path, seed: int, quick: bool, progress: Progress) -> dict[str, Make]:
+    """The parts of the evaluation in order. A quick one has SIFT, one orthophoto and shorter flights."""
+    methods, (town, dense) = configs(data), (cache(partial(read, data)) for read in (barnarp, banepa))
+    sift = methods["sift"]
+    parts: dict[str, Make] = {
+        f"mirafiori_rtk_{name}": partial(rtk_scores, data, config, folder)
+        for name, config in methods.items()
+        if not quick or name == "sift"
     }
-    answers = {}
-    for name, wanted in BARS.items():
-        value = measured[name]
-        bar = min(wanted, tilted["images"]) if name == "sheffield_images_in_one_map" else wanted
-        held = value is not None and (value >= bar if isinstance(bar, int) else value <= bar)
-        answers[name] = {"bar": bar, "measured": value, "held": held}
-    return answers
+    for name in MAPPED_BY[: 1 if quick else None]:
+        if name in methods:
+            images = QUICK_IMAGES if quick else None
+            parts[f"sheffield_flight_{name}"] = partial(tilted_scores, data, methods[name], folder, images)
+    parts["barnarp"] = lambda: cut_scores(town(), sift, folder, seed)
+    if not quick:
+        parts["banepa_ortho"] = lambda: cut_scores(dense(), sift, folder, seed)
+    parts["altitude_bias"] = lambda: bias_scores(town(), sift, seed)
+    count = QUICK_KEYFRAMES if quick else KEYFRAMES
+    parts["endurance"] = lambda: endurance_scores(town(), sift, folder, seed, count, progress)
+    return parts
 
 
 def evaluate(out: Path, seed: int, quick: bool, progress: Progress) -> str:
-    """Run both flights, write report.json and report.html; the table.
+    """Run every part that an earlier run has not finished, write report.json and report.html; the tables.
 
-    Nothing here is random; ``seed`` is kept with the report. A quick run maps with SIFT alone, and the
-    first images of the longer flight.
+    The real flights are what they are; ``seed`` draws paths, noise and light of the others.
     """
     data, started = data_folder(), time.perf_counter()
-    out.mkdir(parents=True, exist_ok=True)
-    methods = configs(data)
-    mapped_by = {"sift"} if quick else set(methods)
-    surveys = (mirafiori(data), sheffield(data, QUICK_IMAGES if quick else None))
-    flights: dict[str, dict[str, Any]] = {}
-    pictures: list[tuple[str, Path]] = []
-    for survey in surveys:
-        with_scale = survey.yaw_rad is None
-        used = methods if survey.yaw_rad is not None else {n: c for n, c in methods.items() if n in mapped_by}
-        flights[survey.name], drawn = _flight(survey, used, with_scale, mapped_by, progress)
-        pictures.append((f"{survey.name} (real imagery)", out / f"{survey.name}.png"))
-        alignment = "similarity" if with_scale else "rigid"
-        draw(pictures[-1][1], survey, drawn, f"{survey.name}, real imagery, {alignment} alignment")
+    folder = out / "sections"
+    sections = Sections(folder, fingerprint(CODE, seed, quick, machine()["versions"]), progress)
+    parts = plan(data, folder, seed, quick, progress)
+    scores = {name: sections.scores(name, make) for name, make in parts.items()}
+    pictures = [
+        (caption, folder / file) for part in scores.values() for caption, file in part.pop(PICTURES, ())
+    ]
+    judged = {f"{bar.section}: {bar.figure}": answer for bar in BARS if (answer := bar.judge(scores))}
     report = {
         "evaluation": "mapping",
-        "imagery": "real: mirafiori_rtk (RTK, gimbal yaw), sheffield_flight (EXIF GPS, tilt estimated)",
+        "imagery": IMAGERY,
         "quick": quick,
-        "bars_of_sift": reached(flights),
+        "bars": judged,
         "seed": seed,
         "seconds": time.perf_counter() - started,
         **machine(),
-        "flights": flights,
-        "config": dataclasses.asdict(methods["sift"]),
+        "sections": scores,
+        "config": dataclasses.asdict(MapperConfig()),
     }
     (out / "report.json").write_text(json.dumps(report, indent=2) + "\n")
-    write_report(
-        out / "report.html", "Mapping: registration and trajectory on real imagery", report, pictures
-    )
-    return f"real imagery: mirafiori_rtk, sheffield_flight\n{table(flights)}\n{out / 'report.html'}"
+    write_report(out / "report.html", "Mapping: registration, trajectory, buildings, rate", report, pictures)
+    return f"{pair_table(scores)}\n\n{path_table(scores)}\n\n{bar_table(judged)}\n{out / 'report.html'}"
+
+
+def pair_table(sections: dict[str, Scores]) -> str:
+    """One line per method and way of looking, of the flights whose pairs have a truth."""
+    names = ("pairs_registered", "translation_median_m", "translation_p90_m", "yaw_median_deg", "yaw_p90_deg")
+    rows = [
+        (section, shown, *(scores[key].get(name) for name in names))
+        for section, scores in sections.items()
+        for key, shown in (("pairs", "rectified"), ("plain_pairs", "plain"))
+        if key in scores
+    ]
+    return _table(("pairs of", "", "registered", "trans med m", "p90 m", "yaw med deg", "p90 deg"), rows)
+
+
+def path_table(sections: dict[str, Scores]) -> str:
+    """One line per flight and way of mapping."""
+    rows = [
+        (section, way.replace("_", " "), f"{path['images']} of {path['of']}", path["rmse_m"],
+         path["rmse_percent"], path.get("loop_closures"), path.get("buildings", {}).get("median_m"))
+        for section, scores in sections.items()
+        for way in ("mapper", "without_loop_closures", "plain_chaining", "similarity_alignment")
+        if (path := scores.get(way))
+    ]  # fmt: skip
+    head = ("trajectory of", "", "images", "rmse m", "% of length", "loops", "buildings med m")
+    return _table(head, rows)
+
+
+def bar_table(judged: dict[str, dict[str, Any]]) -> str:
+    """One line per bar."""
+    rows = [
+        (name, f"{limit} {answer[limit]:g}", answer["measured"], "held" if answer["held"] else "MISSED")
+        for name, answer in judged.items()
+        for limit in answer.keys() & {"at least", "at most"}
+    ]
+    return _table(("bar", "", "measured", ""), rows)
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
+    shown = [head, *(tuple(_cell(value) for value in row) for row in rows)]
+    widths = [max(len(row[i]) for row in shown) for i in range(len(head))]
+    return "\n".join("  ".join(f"{cell:>{w}}" for cell, w in zip(row, widths, strict=True)) for row in shown)
+
+
+def _cell(value: Any) -> str:
+    return "-" if value is None else f"{value:.3f}" if isinstance(value, float) else str(value)

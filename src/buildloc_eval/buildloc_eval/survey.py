@@ -15,7 +15,7 @@ from buildloc_mapper.registration import robust_similarity
 from buildloc_mapper.similarity import fit_similarity
 from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.ground import Quaternion, pixels_to_level
-from buildloc_msgs_py.types import CameraModel, FloatArray, Frame
+from buildloc_msgs_py.types import CameraModel, FloatArray, Frame, Mask
 from pyproj import Transformer
 from scipy.optimize import minimize
 
@@ -51,6 +51,11 @@ class Survey:
         image = np.asarray(cv2.imread(str(self.images[index])), dtype=np.uint8)
         altitude, attitude = self.altitudes_m[index], self.attitudes[index]
         return Frame(index * 1_000_000_000, "camera", image, self.camera, altitude, attitude)
+
+    def mask(self, index: int) -> Mask:
+        """Nothing: buildings are not mapped here."""
+        empty = np.zeros((self.camera.height, self.camera.width), dtype=np.uint8)
+        return Mask(index * 1_000_000_000, "camera", empty)
 
 
 def _local_m(latitudes_deg: list[float], longitudes_deg: list[float]) -> FloatArray:

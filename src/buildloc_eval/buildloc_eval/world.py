@@ -73,28 +73,18 @@ def to_utm(latitude_deg: float, longitude_deg: float) -> tuple[int, float, float
     return epsg, float(east), float(north)
 
 
-class OrthoWorld:
-    """A real orthophoto, north up, placed by a JSON with origin_lat_deg, origin_lon_deg and gsd_m."""
+class PictureWorld:
+    """A north-up picture in memory, (H, W) or (H, W, 3), whose outer top-left corner lies at ``left_m``,
+    ``top_m`` of a UTM zone."""
 
-    def __init__(self, image: Path, georef: Path) -> None:
-        try:
-            placed = json.loads(georef.read_text())
-            latitude, longitude = float(placed["origin_lat_deg"]), float(placed["origin_lon_deg"])
-            self._gsd_m = float(placed["gsd_m"])
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise WorldError(
-                f"{georef}: is no georeference; give a JSON with origin_lat_deg, origin_lon_deg, gsd_m"
-            ) from error
-        picture = cv2.imread(str(image), cv2.IMREAD_COLOR)
-        if picture is None:
-            raise WorldError(f"{image}: is not a readable image; give a JPEG, PNG or TIFF orthophoto")
-        self._image = np.asarray(picture, dtype=np.uint8)
-        self.epsg, self._left_m, self._top_m = to_utm(latitude, longitude)
+    def __init__(self, image: ByteArray, epsg: int, left_m: float, top_m: float, gsd_m: float) -> None:
+        self.epsg = epsg
+        self._image, self._left_m, self._top_m, self._gsd_m = image, left_m, top_m, gsd_m
 
     @property
     def bounds_m(self) -> Box:
         """The whole picture."""
-        height, width = self._image.shape[:2]
+        height, width = self._shape
         return (
             self._left_m, self._top_m - height * self._gsd_m, self._left_m + width * self._gsd_m, self._top_m,
         )  # fmt: skip
@@ -102,13 +92,65 @@ class OrthoWorld:
     def window(self, box_m: Box) -> Window:
         """The pixels that touch the box."""
         west, south, east, north = box_m
-        height, width = self._image.shape[:2]
+        height, width = self._shape
         c0, c1 = _pixels(west - self._left_m, east - self._left_m, self._gsd_m, width)
         r0, r1 = _pixels(self._top_m - north, self._top_m - south, self._gsd_m, height)
         if c1 <= c0 or r1 <= r0:
             raise WorldError("the flight leaves the orthophoto; shorten it or choose another region")
         left, top = self._left_m + c0 * self._gsd_m, self._top_m - r0 * self._gsd_m
-        return Window(self._image[r0:r1, c0:c1], left, top, self._gsd_m)
+        return Window(self._part(r0, r1, c0, c1), left, top, self._gsd_m)
+
+    @property
+    def _shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        height, width = self._image.shape[:2]
+        return height, width
+
+    def _part(self, r0: int, r1: int, c0: int, c1: int) -> ByteArray:
+        return self._image[r0:r1, c0:c1]
+
+
+class MirroredWorld(PictureWorld):
+    """A picture laid ``times`` side by side and one below the other, every second one mirrored: the ground
+    goes on over the seams, and of two times no two places look alike. The first is the picture itself."""
+
+    def __init__(self, picture: PictureWorld, times: int) -> None:
+        super().__init__(picture._image, picture.epsg, picture._left_m, picture._top_m, picture._gsd_m)
+        self._times = times
+
+    @property
+    def _shape(self) -> tuple[int, int]:
+        height, width = super()._shape
+        return self._times * height, self._times * width
+
+    def _part(self, r0: int, r1: int, c0: int, c1: int) -> ByteArray:
+        height, width = super()._shape
+        rows, columns = _mirrored(np.arange(r0, r1), height), _mirrored(np.arange(c0, c1), width)
+        return self._image[rows[:, None], columns[None, :]]
+
+
+class OrthoWorld(PictureWorld):
+    """A real orthophoto, north up, placed by a JSON with origin_lat_deg, origin_lon_deg and gsd_m."""
+
+    def __init__(self, image: Path, georef: Path) -> None:
+        try:
+            placed = json.loads(georef.read_text())
+            latitude, longitude = float(placed["origin_lat_deg"]), float(placed["origin_lon_deg"])
+            gsd_m = float(placed["gsd_m"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise WorldError(
+                f"{georef}: is no georeference; give a JSON with origin_lat_deg, origin_lon_deg, gsd_m"
+            ) from error
+        picture = cv2.imread(str(image), cv2.IMREAD_COLOR)
+        if picture is None:
+            raise WorldError(f"{image}: is not a readable image; give a JPEG, PNG or TIFF orthophoto")
+        super().__init__(np.asarray(picture, dtype=np.uint8), *to_utm(latitude, longitude), gsd_m)
+
+
+def _mirrored(index: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """0 to count - 1, back to 0, and so on."""
+    folded = index % (2 * count)
+    return np.minimum(folded, 2 * count - 1 - folded)
 
 
 def _pixels(low_m: float, high_m: float, gsd_m: float, count: int) -> tuple[int, int]:

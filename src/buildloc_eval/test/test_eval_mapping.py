@@ -6,16 +6,19 @@ import math
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from buildloc_eval.mapping import Path2d, chain, configs, links, pair_scores, table, trajectory_scores
+from buildloc_eval.flown import Path2d, align
+from buildloc_eval.mapping import Bar, bar_table, building_scores, configs, pair_table, path_table
+from buildloc_eval.pairs import chain, links, pair_scores
 from buildloc_eval.survey import LEVEL, Survey, attitude_of, mirafiori, sheffield
 from buildloc_mapper.registration import Link
 from buildloc_mapper.similarity import Similarity
 from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.ground import heading_rad, rotation_matrix
-from buildloc_msgs_py.types import CameraModel
+from buildloc_msgs_py.types import CameraModel, LocalMap
 
 DATA = Path(os.environ.get("BUILDLOC_DATA", Path(__file__).parents[4] / "shared" / "data"))
 YAW = np.array([0.3, 0.4, 2.0, 2.1, -1.0])
@@ -42,15 +45,23 @@ def true_links() -> list[Link | None]:
     return [Link(inverse(pose(i)).compose(pose(i + 1)), 50, np.eye(4)) for i in range(len(TRUE) - 1)]
 
 
+def rmse(path: Path2d, with_scale: bool = False) -> dict[str, Any]:
+    aligned = align(survey(TRUE, YAW), path, with_scale)
+    assert aligned is not None
+    return aligned.scores
+
+
 def test_true_links_have_no_error_and_chain_to_the_true_path() -> None:
     scores, constants = pair_scores(survey(TRUE, YAW), YAW, true_links())
     assert scores["pairs_registered"] == 4
     assert scores["translation_p90_m"] == pytest.approx(0.0, abs=1e-9)
     assert scores["yaw_p90_deg"] == pytest.approx(0.0, abs=1e-9)
     assert (constants.height_factor, constants.heading_rad) == pytest.approx((1.0, 0.0))
-    flown, aligned = trajectory_scores(survey(TRUE, YAW), chain(true_links()), with_scale=False)
-    assert flown["images"] == 5 and flown["rmse_m"] == pytest.approx(0.0, abs=1e-6)
-    assert aligned == pytest.approx(TRUE, abs=1e-6)
+    flown = align(survey(TRUE, YAW), chain(true_links()), with_scale=False)
+    assert flown is not None
+    assert flown.scores["images"] == 5 and flown.scores["rmse_m"] == pytest.approx(0.0, abs=1e-6)
+    assert flown.places_m == pytest.approx(TRUE, abs=1e-6)
+    assert flown.to_world == pytest.approx(pose(0), abs=1e-6)
 
 
 def test_a_wrong_height_is_an_error_that_the_fit_names() -> None:
@@ -60,12 +71,11 @@ def test_a_wrong_height_is_an_error_that_the_fit_names() -> None:
     assert scores["translation_median_m"] > 0.2
     assert constants.height_factor == pytest.approx(1.05)
     assert scores["fitted_to_truth"]["translation_p90_m"] == pytest.approx(0.0, abs=1e-9)
-    rigid, _ = trajectory_scores(survey(TRUE, YAW), chain(list(low)), with_scale=False)
-    scaled, _ = trajectory_scores(survey(TRUE, YAW), chain(list(low)), with_scale=True)
-    put_right, _ = trajectory_scores(survey(TRUE, YAW), constants.correct(chain(list(low))), with_scale=False)
+    path = chain(list(low))
+    rigid, scaled = rmse(path), rmse(path, with_scale=True)
     assert rigid["rmse_m"] > 0.1 > scaled["rmse_m"]
-    assert scaled["scale_of_alignment"] == pytest.approx(1.05)
-    assert put_right["rmse_m"] == pytest.approx(0.0, abs=1e-6)
+    assert rigid["scale"] == scaled["scale"] == pytest.approx(1.05)
+    assert rmse(constants.correct(path))["rmse_m"] == pytest.approx(0.0, abs=1e-6)
 
 
 def test_a_tilted_axis_is_told_from_the_height() -> None:
@@ -80,8 +90,7 @@ def test_a_tilted_axis_is_told_from_the_height() -> None:
     assert constants.height_factor == pytest.approx(1.0)
     assert constants.axis_m == pytest.approx([-0.5, 0.2])
     path = constants.correct(chain(list(off)))
-    put_right, _ = trajectory_scores(survey(TRUE, YAW), path, with_scale=False)
-    assert put_right["rmse_m"] == pytest.approx(0.0, abs=1e-6)
+    assert rmse(path)["rmse_m"] == pytest.approx(0.0, abs=1e-6)
 
 
 def test_a_chain_ends_where_a_link_is_missing() -> None:
@@ -91,7 +100,7 @@ def test_a_chain_ends_where_a_link_is_missing() -> None:
     scores, _ = pair_scores(survey(TRUE, YAW), YAW, broken)
     assert (scores["pairs"], scores["pairs_registered"]) == (4, 3)
     short = Path2d((0, 1), (pose(0), pose(1)), {})
-    assert trajectory_scores(survey(TRUE, YAW), short, with_scale=False)[0] == {"images": 2}
+    assert align(survey(TRUE, YAW), short, with_scale=False) is None
 
 
 def test_attitudes_look_where_they_should() -> None:
@@ -103,10 +112,40 @@ def test_attitudes_look_where_they_should() -> None:
     assert heading_rad(attitude_of(0.7, 0.3, 0.0)) == pytest.approx(0.7)
 
 
-def test_the_table_has_a_line_for_every_method() -> None:
-    flights = {"a": {"images": 3, "sift": {"mapper": {"rmse_m": 1.25, "images": 3}}, "xfeat": {}}}
-    lines = table(flights).splitlines()
-    assert len(lines) == 3 and "1.250" in lines[1] and len({len(line) for line in lines}) == 1
+def test_tables_have_a_line_for_every_method_and_way() -> None:
+    path = {"images": 3, "of": 4, "rmse_m": 1.25, "rmse_percent": 0.5, "buildings": {"median_m": 0.25}}
+    sections = {"a": {"mapper": path, "plain_chaining": path, "pairs": {"pairs_registered": 7}}, "b": {}}
+    paths, pairs = path_table(sections).splitlines(), pair_table(sections).splitlines()
+    assert (
+        len(paths) == 3 and paths[1].split()[2:6] == ["3", "of", "4", "1.250"] and paths[2].endswith("0.250")
+    )
+    assert len(pairs) == 2 and "7" in pairs[1]
+    assert all(len({len(line) for line in lines}) == 1 for lines in (paths, pairs))
+
+
+def test_bars_are_judged_by_what_was_measured() -> None:
+    sections = {"a": {"mapper": {"rmse_m": 1.0, "images": 30}}}
+    held, missed = Bar("a", "mapper.rmse_m", 1.0), Bar("a", "mapper.images", 31, at_least=True)
+    assert held.judge(sections) == {"at most": 1.0, "measured": 1.0, "held": True}
+    assert missed.judge(sections) == {"at least": 31, "measured": 30, "held": False}
+    absent = Bar("a", "mapper.yaw.deg", 1.0).judge(sections)
+    assert absent == {"at most": 1.0, "measured": None, "held": False}
+    assert Bar("b", "mapper.rmse_m", 1.0).judge(sections) is None
+    assert "MISSED" in bar_table({"images": missed.judge(sections)})
+
+
+def test_only_buildings_seen_whole_are_scored() -> None:
+    places = np.array([(0.0, 0.0), (10.0, 0.0), (20.0, 0.0)])
+    cut = np.array([False, False, True])
+    none = np.zeros(3)
+    found = LocalMap(
+        0, np.arange(3), places, none, np.zeros((3, 4)), none.astype(int), np.zeros((3, 2, 2)), cut
+    )
+    turned = Similarity(5.0, 5.0, math.pi / 2, 1.0)
+    true = np.array([(5.0, 5.0), (5.0, 15.5)])
+    scores = building_scores(found, turned, true)
+    assert (scores["buildings"], scores["median_m"]) == (2, pytest.approx(0.25))
+    assert building_scores(found.select(cut), turned, true) == {"buildings": 0}
 
 
 def test_absent_flights_are_one_line(tmp_path: Path) -> None:

@@ -17,16 +17,20 @@ MIN_CONFIDENCE = 0.2  # LoFTR's own
 
 @dataclass(frozen=True)
 class Fitted:
-    """Input of the network, (1, 1, h, w) in 0..1, and by how much the image was zoomed into it."""
+    """A level image (h, w) uint8 in the size of the network's input, and by how much it was zoomed."""
 
-    tensor: Tensor
+    grey: ByteArray
     zoom: float
+
+    @property
+    def tensor(self) -> Tensor:
+        """(1, 1, h, w) in 0..1, four times the memory: made only when it is needed."""
+        return self.grey[None, None].astype(np.float32) / 255.0
 
 
 def fitted(grey: ByteArray, size: tuple[int, int]) -> Fitted:
     """A level image as an input of a LoFTR of this size (width, height)."""
-    canvas, zoom = fit_into(grey, size)
-    return Fitted(canvas[None, None].astype(np.float32) / 255.0, zoom)
+    return Fitted(*fit_into(grey, size))
 
 
 class CoarseLoftr:

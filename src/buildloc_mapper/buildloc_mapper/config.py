@@ -25,25 +25,39 @@ class MapperConfig:
         180.0, "largest deviation of a pair's turn from the gimbal's, deg; 180: not compared", 0.1, 180.0
     )
     fallback_keyframes: int = param(3, "earlier keyframes tried when the previous one fails", 0, 100)
-    max_lost: int = param(3, "keyframes in a row without a link before the map starts anew", 1, 1000)
-    loop_radius_m: float = param(40.0, "keyframes nearer than this are tested as loop closures, m", 0.0, 1e4)
+    skip_links: int = param(1, "keyframes before the one it is linked to that a keyframe links to", 0, 100)
+    loop_radius_m: float = param(40.0, "distance at which keyframes are tested as loop closures, m", 0.0, 1e4)
     loop_gap: int = param(6, "fewest keyframes between the two ends of a loop closure", 2, 10000)
-    loop_tests: int = param(2, "loop closures tested per keyframe", 0, 100)
+    loop_tests: int = param(2, "loop closures and joins of submaps tested per keyframe", 0, 100)
     sigma_position_m: float = param(0.5, "standard deviation of a link's translation, m", 0.001, 100.0)
     sigma_rotation_deg: float = param(0.3, "standard deviation of a link's rotation, deg", 0.001, 45.0)
     sigma_log_scale: float = param(0.01, "standard deviation of a link's log scale", 1e-5, 1.0)
-    sigma_unit_scale: float = param(0.02, "standard deviation of the unit-scale prior", 1e-5, 1.0)
+    sigma_heading_deg: float = param(
+        2.0, "standard deviation of the gimbal's turn between two keyframes, deg", 0.01, 180.0
+    )
+    altitude_noise: float = param(
+        0.02, "standard deviation of the altimeter's reading, relative to the height", 1e-5, 1.0
+    )
+    altitude_drift: float = param(
+        0.001, "standard deviation of the altimeter's drift after 1 s, relative to the height", 0.0, 1.0
+    )
+    altitude_bias: float = param(
+        0.03, "standard deviation of the altimeter's constant error, relative to the height", 0.0, 1.0
+    )
     loop_weight: float = param(2.0, "weight of a loop closure relative to a consecutive link", 0.01, 100.0)
     huber_k: float = param(
         1.345, "residual in standard deviations where the Huber loss turns linear", 0.1, 10.0
     )
     map_gsd_m: float = param(0.25, "ground sampling distance of the fused map, m", 0.05, 5.0)
     min_observations: int = param(2, "fewest keyframes that must see a building pixel", 1, 100)
-    min_share: float = param(0.5, "smallest share of the views of a pixel that call it building", 0.01, 1.0)
+    min_share: float = param(0.5, "more than this share of a pixel's views must call it building", 0.0, 0.99)
     redraw_px: float = param(
         0.5, "a keyframe that moved more than this is drawn anew, map pixels", 0.0, 100.0
     )
-    max_redraws: int = param(4, "keyframes drawn, or drawn anew, per keyframe; the others follow", 1, 100000)
+    max_redraws: int = param(3, "moved keyframes drawn anew per keyframe; the others follow", 0, 100000)
+    max_stale_m: float = param(
+        10.0, "keyframes that moved more than this are drawn anew at once, however many, m", 0.0, 1e6
+    )
     sigma_centroid_m: float = param(
         0.5, "standard deviation of a centroid in one keyframe, before any was compared, m", 0.001, 100.0
     )

@@ -18,7 +18,7 @@ from shapely.geometry import Polygon
 
 from buildloc_mapper.config import MapperConfig
 from buildloc_mapper.fusion import Fusion
-from buildloc_mapper.identity import continued
+from buildloc_mapper.identity import Outlines, continued
 from buildloc_mapper.similarity import Similarity
 from buildloc_mapper.tiles import TILE_PX, Box, Counts, Tile, read
 
@@ -26,6 +26,7 @@ LocalOutlines = tuple[Polygon, ...]
 CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 VIEWS_COMPARED = 20  # keyframes per tile whose centroids are compared: a flight may hover
 PRIOR_VIEWS = 2.0  # what sigma_centroid_m weighs against their scatter
+LARGEST_PX = 4096  # longest side of a building: what is larger is ground taken for one, and fills the memory
 SAME_AREA = 0.7  # smaller to larger area of what one keyframe and the map take for the same building
 
 # Steps to the four neighbours of a tile, the tile's own pixels along that side, and the neighbour's.
@@ -68,20 +69,19 @@ class _Labels:
 
 @dataclass(frozen=True)
 class _Component:
-    """The confirmed pixels of one building, 0 or 1, in a box that has a free pixel on every side."""
+    """Confirmed pixels that are connected, in a box that has a free pixel on every side."""
 
     parts: tuple[Part, ...]
     box: Box
-    mask: ByteArray
 
 
 def confirmed(counts: Counts, config: MapperConfig) -> ByteArray:
-    """0 or 1: building in enough keyframes and in a large enough share of those that saw the pixel.
+    """0 or 1: building in enough keyframes and in more than ``min_share`` of those that saw the pixel.
 
     ``counts`` is (2, rows, columns), seen and building.
     """
     seen, building = counts
-    enough = (building >= config.min_observations) & (building >= config.min_share * seen)
+    enough = (building >= config.min_observations) & (building > config.min_share * seen)
     return np.asarray(enough, dtype=np.uint8)
 
 
@@ -183,45 +183,53 @@ class Extractor:
         return found
 
     def _component(self, parts: Sequence[Part]) -> _Component:
-        places = []
+        corners = []
         for (i, j), label in parts:
             x, y, width, height = self._tiles[i, j].stats[label, :4].tolist()
-            places.append(Box(x, y, x + width, y + height))
-        corner = [(i * TILE_PX, j * TILE_PX) for (i, j), _ in parts]
-        left = min(p.left + x for p, (x, _) in zip(places, corner, strict=True)) - 1
-        top = min(p.top + y for p, (_, y) in zip(places, corner, strict=True)) - 1
-        right = max(p.right + x for p, (x, _) in zip(places, corner, strict=True)) + 1
-        bottom = max(p.bottom + y for p, (_, y) in zip(places, corner, strict=True)) + 1
-        mask = np.zeros((bottom - top, right - left), dtype=np.uint8)
-        for (tile, label), p, (x, y) in zip(parts, places, corner, strict=True):
-            row, column = p.top + y - top, p.left + x - left
-            own = self._tiles[tile].labels[p.top : p.bottom, p.left : p.right] == label
-            mask[row : row + own.shape[0], column : column + own.shape[1]] |= own
-        return _Component(tuple(parts), Box(left, top, right, bottom), mask)
+            x, y = x + i * TILE_PX, y + j * TILE_PX
+            corners.append((x, y, x + width, y + height))
+        left, top, right, bottom = zip(*corners, strict=True)
+        return _Component(tuple(parts), Box(min(left), min(top), max(right), max(bottom)).grown(1))
+
+    def _mask(self, component: _Component) -> ByteArray:
+        """0 or 1 per pixel of the component's box."""
+        mask = np.zeros(component.box.shape, dtype=np.uint8)
+        labels: defaultdict[Tile, list[int]] = defaultdict(list)
+        for tile, label in component.parts:
+            labels[tile].append(label)
+        for tile, in_tile, in_box in component.box.pieces():
+            for label in labels[tile]:
+                mask[in_box] |= self._tiles[tile].labels[in_tile] == label
+        return mask
+
+    def _may_be_building(self, component: _Component) -> bool:
+        rows, columns = component.box.grown(-1).shape
+        area = rows * columns * self._config.map_gsd_m**2
+        return max(rows, columns) <= LARGEST_PX and area >= self._config.min_area_m2
 
     def _measure(self, fusion: Fusion, components: Sequence[_Component]) -> Table:
-        """Everything but the ids, of the components that are large enough."""
+        """Everything but the ids, of the components whose size is a building's."""
         config = self._config
+        components = [component for component in components if self._may_be_building(component)]
+        masks = [self._mask(component) for component in components]
         contours = []
-        for component in components:
-            offset = component.box[:2]
-            ring, _ = cv2.findContours(
-                component.mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE, offset=offset
-            )
-            contours.append(np.asarray(ring[0], dtype=np.int32))
+        for component, mask in zip(components, masks, strict=True):
+            how = (cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+            rings, _ = cv2.findContours(mask, *how, offset=component.box[:2])
+            contours.append(np.asarray(rings[0], dtype=np.int32))
         outlines = traced(contours, config.map_gsd_m, (-0.5, -0.5))
         areas = shapely.area(outlines)  # NaN for None
         rows = np.flatnonzero((areas > 0.0) & (areas >= config.min_area_m2))
         table = np.zeros(len(rows), dtype=BUILDING)
-        outlines = shapely.simplify(outlines[rows], config.simplify_m)
+        outlines = _simplified(outlines[rows], config.simplify_m)
         measured = footprints(outlines)
         table["outline"], table["centroid"] = outlines, measured.centroids_m
         table["area"], table["shape"] = measured.areas_m2, measured.shapes
-        for row, component in zip(table, (components[i] for i in rows.tolist()), strict=True):
+        for row, index in zip(table, rows.tolist(), strict=True):
+            component, inside = components[index], masks[index] > 0
             seen, building = read(fusion.counts, component.box)
-            inside = component.mask > 0
             unseen = cv2.dilate((seen < config.min_observations).astype(np.uint8), CROSS)
-            row["observations"], row["cut"] = int(np.median(building[inside])), bool(unseen[inside].any())
+            row["observations"], row["cut"] = int(building[inside].max()), bool(unseen[inside].any())
             row["parts"] = component.parts
         table["covariance"] = self._covariances(fusion, table)
         if len(table):
@@ -267,6 +275,15 @@ class Extractor:
         new = int((known < 0).sum())
         built["id"][known < 0] = np.arange(self._next_id, self._next_id + new)
         self._next_id += new
+
+
+def _simplified(outlines: Outlines, tolerance_m: float) -> Outlines:
+    """Quickly, and with care (ten times slower) only the few that would cross themselves."""
+    quick = shapely.simplify(outlines, tolerance_m, preserve_topology=False)
+    broken = ~shapely.is_valid(quick) | (shapely.get_type_id(quick) != shapely.GeometryType.POLYGON)
+    broken |= ~(shapely.area(quick) > 0.0)
+    quick[broken] = shapely.simplify(outlines[broken], tolerance_m)
+    return np.asarray(quick, dtype=object)
 
 
 def _squared_distances(some_m: FloatArray, others_m: FloatArray) -> FloatArray:

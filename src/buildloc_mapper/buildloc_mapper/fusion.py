@@ -131,10 +131,10 @@ class Fusion:
     ) -> set[Tile]:
         """Make the counts those of ``poses``; the tiles that changed.
 
-        Keyframes that are gone are taken out. Of those that are new, or moved by ``redraw_px`` since they
-        were drawn, at most ``max_redraws`` are drawn unless ``everything`` is asked for: new ones first, the
-        latest of them, then those that moved most. So a loop closure that moves the whole flight costs no
-        more than any keyframe, and the map follows it over the next ones.
+        Keyframes that are gone are taken out, new ones drawn. Those that moved by ``redraw_px`` since they
+        were drawn are drawn anew, those that moved most first: ``max_redraws`` of them, but all that moved
+        by more than ``max_stale_m``, and all when ``everything`` is asked for. So a loop closure that moves
+        the whole flight a little costs no more than any keyframe, and the map follows over the next ones.
         """
         dirty: set[Tile] = set()
         if not self.drawn.keys() & poses.keys():  # another map: quicker than taking out every keyframe
@@ -143,9 +143,11 @@ class Fusion:
         for gone in self.drawn.keys() - poses.keys():
             drawn = self.drawn.pop(gone)
             dirty.update(self._erase(gone, drawn, drawn.view.mask()))
-        due = [*sorted(poses.keys() - self.drawn.keys(), reverse=True), *self._moved(poses)]
-        now = due if everything else due[: self._config.max_redraws]
-        self.waiting = len(due) - len(now)
+        moved, shift_m = self._moved(poses)
+        far = int((shift_m > self._config.max_stale_m).sum())
+        redraws = len(moved) if everything else max(far, self._config.max_redraws)
+        self.waiting = max(0, len(moved) - redraws)
+        now = [*sorted(poses.keys() - self.drawn.keys()), *moved[:redraws]]
         for keyframe in now:
             mask = views[keyframe].mask()
             if keyframe in self.drawn:
@@ -153,19 +155,17 @@ class Fusion:
             dirty.update(self._draw(keyframe, views[keyframe], mask, poses[keyframe]))
         return dirty
 
-    def _moved(self, poses: Mapping[int, Similarity]) -> list[int]:
-        """Keyframes drawn too far from where they are now, those that moved most first."""
-        if not self.drawn:
-            return []
+    def _moved(self, poses: Mapping[int, Similarity]) -> tuple[list[int], FloatArray]:
+        """Keyframes drawn too far from where they are now, and by how much; those that moved most first."""
         ids = np.array(list(self.drawn), dtype=np.int64)
-        before = np.array([drawn.pose for drawn in self.drawn.values()])
-        after = np.array([poses[keyframe] for keyframe in self.drawn])
+        before = np.array([drawn.pose for drawn in self.drawn.values()]).reshape(-1, 4)
+        after = np.array([poses[keyframe] for keyframe in self.drawn]).reshape(-1, 4)
         reach = np.array([drawn.reach_m for drawn in self.drawn.values()])
         turned = after[:, 3] * np.exp(1j * after[:, 2]) - before[:, 3] * np.exp(1j * before[:, 2])
         shift = np.hypot(*(after - before)[:, :2].T) + np.abs(turned) * reach
         order = np.argsort(-shift, kind="stable")
-        too_far = shift[order] > self._config.redraw_px * self._config.map_gsd_m
-        return [int(keyframe) for keyframe in ids[order][too_far]]
+        order = order[shift[order] > self._config.redraw_px * self._config.map_gsd_m]
+        return ids[order].tolist(), shift[order]
 
     def _draw(self, keyframe: int, view: View, mask: ByteArray, pose: Similarity) -> list[Tile]:
         footprint = view.footprint(mask, pose, self._config.map_gsd_m)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from buildloc_msgs_py.ground import border, heading_rad, level_to_ray, pixels_to_level, resample
+from buildloc_msgs_py.ground import border, heading_rad, level_to_ray, pixels_to_level, resample, resized
 from buildloc_msgs_py.types import ByteArray, FloatArray, Frame
 from numpy.typing import NDArray
 
@@ -52,16 +52,9 @@ class LevelImage:
 def level_image(frame: Frame, width_px: int) -> LevelImage:
     """The frame's ground at the camera's own ground sampling distance, or ``width_px`` columns of it."""
     grey, camera = cv2.cvtColor(frame.image_bgr, cv2.COLOR_BGR2GRAY), frame.camera
-    shrink = min(1.0, width_px / camera.width)
-    if shrink < 1.0:
-        size = (round(camera.width * shrink), round(camera.height * shrink))
-        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-        zoom_u, zoom_v = size[0] / camera.width, size[1] / camera.height
-        # Pixel centres are whole numbers, so shrinking maps u to (u + 0.5) zoom - 0.5.
-        camera = replace(
-            camera, width=size[0], height=size[1], fx=camera.fx * zoom_u, fy=camera.fy * zoom_v,
-            cx=(camera.cx + 0.5) * zoom_u - 0.5, cy=(camera.cy + 0.5) * zoom_v - 0.5,
-        )  # fmt: skip
+    if width_px < camera.width:
+        camera = resized(camera, width_px / camera.width)
+        grey = cv2.resize(grey, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     gsd = frame.altitude_m / camera.fx
     edge = pixels_to_level(border(camera), camera, frame.altitude_m, frame.attitude_xyzw)
     centre = np.array([[(camera.width - 1) / 2.0, (camera.height - 1) / 2.0]])

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import math
 import time
-from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from buildloc_msgs_py.config import check
 from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.ground import validate_frame
-from buildloc_msgs_py.types import Frame, Keyframe, LocalMap, Mask
+from buildloc_msgs_py.types import FloatArray, Frame, Keyframe, LocalMap, Mask
 
+from buildloc_mapper.atlas import Atlas
 from buildloc_mapper.config import MapperConfig
 from buildloc_mapper.extraction import Extractor, LocalOutlines
 from buildloc_mapper.fusion import Fusion, View
-from buildloc_mapper.pose_graph import Edge, optimize
-from buildloc_mapper.registration import Link, Prepared, Registration
-from buildloc_mapper.similarity import Similarity
-
-ORIGIN = Similarity(0.0, 0.0, 0.0, 1.0)
+from buildloc_mapper.pose_graph import PoseGraph
+from buildloc_mapper.similarity import Similarity, compose_covariance
+from buildloc_mapper.tracking import Lost, Tracked, Tracker
 
 
 class MapperError(BuildlocError):
@@ -28,123 +26,119 @@ class MapperError(BuildlocError):
 
 @dataclass(frozen=True)
 class MapUpdate:
-    """The optimised keyframes, the buildings of the map with their outlines, and the funnel."""
+    """The optimised keyframes of one submap, its buildings with their outlines, and the funnel.
+
+    ``scale_sigma`` in the funnel is the relative standard deviation of the map's scale. ``links``: the
+    earlier and the later keyframe, by their place in ``keyframes``, and what links them: ``consecutive``,
+    ``skip`` or ``loop``.
+    """
 
     keyframes: tuple[Keyframe, ...]
     local_map: LocalMap
     outlines: LocalOutlines
     funnel: dict[str, float]
-
-
-@dataclass(frozen=True)
-class _Node:
-    stamp_ns: int
-    prepared: Prepared
-    view: View
+    links: tuple[tuple[int, int, str], ...]
 
 
 class Mapper:
-    """One growing map. ``buildloc_map`` has its origin and heading from the map's first keyframe."""
+    """One growing map. ``buildloc_map`` has its origin and heading from the map's first keyframe, its scale
+    from the altimeter."""
 
     def __init__(self, config: MapperConfig) -> None:
         check(config)
         self.config = config
-        self._registration = Registration(config)
+        self._atlas = Atlas(config)
+        self._tracker = Tracker(config)
         self.reset()
 
     def reset(self) -> None:
         """Forget the flight."""
-        self._rejected: Counter[str] = Counter()
-        self._restarts = 0
-        self._earlier = 0
-        self._nodes: list[_Node] = []
+        self._atlas.reset()
+        self._tracker.reset()
+        self._views: dict[int, View] = {}
         self._fusion, self._extractor = Fusion(self.config), Extractor(self.config)
-        self._start_anew()
-
-    def _start_anew(self) -> None:
-        self._earlier += len(self._nodes)
-        self._nodes = []
-        self._poses: list[Similarity] = []
-        self._edges: list[Edge] = []
-        self._lost = 0
+        self._latest: int | None = None  # keyframe of a map
+        self._latest_stamp_ns: int | None = None
 
     def add(self, frame: Frame, mask: Mask) -> MapUpdate | None:
-        """Add a keyframe and its mask; the new map, or None when the keyframe links to nothing.
+        """Add a keyframe and its mask; the new map, or None when the keyframe links to nothing yet.
 
-        After ``max_lost`` such keyframes in a row the map starts anew from the latest. Raises
-        MapperError when frame and mask do not belong together, WireError for unusable telemetry.
+        Such a keyframe is kept: when a later one links to it, the two are a new map, which is joined to the
+        earlier ones as soon as the same ground is seen again. Raises MapperError when frame and mask do not
+        belong together or the frame is not later than the one before, WireError for unusable telemetry; the
+        map is then as it was.
         """
         validate_frame(frame)
         if mask.stamp_ns != frame.stamp_ns or mask.pixels.shape != frame.image_bgr.shape[:2]:
             raise MapperError("mask and image differ in stamp or size; feed the segmenter's own masks")
+        if self._latest_stamp_ns is not None and frame.stamp_ns <= self._latest_stamp_ns:
+            self._atlas.counts["rejected_stamp"] += 1
+            late_s = (self._latest_stamp_ns - frame.stamp_ns) * 1e-9
+            raise MapperError(
+                f"keyframe is {late_s:.3f} s before the latest or at its stamp; feed keyframes in the order "
+                "they were taken, and reset before another flight"
+            )
         started = time.perf_counter()
         view = View.of(frame, mask, self.config)
-        node = _Node(frame.stamp_ns, self._registration.prepare(frame), view)
-        if not self._attach(node):
+        self._latest_stamp_ns = frame.stamp_ns
+        keyframe = self._atlas.add(frame)
+        self._views[keyframe] = view
+        if keyframe > 0 and len(self._atlas.submap(keyframe).poses) == 1:
             return None
-        self._close_loops()
-        self._poses = optimize(self._poses, self._edges, self.config)
-        return self._update(started)
+        graph, before, self._latest = self._atlas.submap(keyframe), self._latest, keyframe
+        T_new_old = None  # noqa: N806
+        if before is not None and before in graph.poses:
+            T_new_old = graph.poses[keyframe].inverse().compose(graph.poses[before])  # noqa: N806
+        self._tracker.rebase(keyframe, frame, T_new_old)
+        return self._update(keyframe, started)
+
+    def track(self, frame: Frame) -> Tracked | Lost:
+        """Where a frame between keyframes is, in the latest keyframe of the map. Raises WireError for
+        unusable telemetry."""
+        return self._tracker.track(frame)
+
+    def on_map(self, tracked: Tracked) -> tuple[Similarity, FloatArray]:
+        """A tracked pose in ``buildloc_map``, and its (4, 4) covariance over x, y, yaw and log scale as seen
+        from the map's first keyframe, the altimeter's bias left out."""
+        graph = self._atlas.submap(tracked.keyframe)
+        pose, covariance = graph.poses[tracked.keyframe], graph.covariance(tracked.keyframe)
+        to_frame = tracked.T_keyframe_frame
+        return pose.compose(to_frame), compose_covariance(pose, covariance, to_frame, tracked.covariance)
 
     def finish(self) -> MapUpdate | None:
         """The map with every keyframe drawn where it is by now; None before the first."""
-        return self._update(time.perf_counter(), everything=True) if self._nodes else None
+        if self._latest is None:
+            return None
+        return self._update(self._latest, time.perf_counter(), everything=True)
 
-    def _update(self, started: float, everything: bool = False) -> MapUpdate:
-        ids = range(self._earlier, self._earlier + len(self._nodes))
-        views = {i: node.view for i, node in zip(ids, self._nodes, strict=True)}
-        dirty = self._fusion.update(views, dict(zip(ids, self._poses, strict=True)), everything)
-        found = self._extractor.update(self._fusion, dirty, self._nodes[-1].stamp_ns)
+    def _update(self, keyframe: int, started: float, everything: bool = False) -> MapUpdate:
+        graph, stamp = self._atlas.submap(keyframe), self._atlas.stamp_ns
+        dirty = self._fusion.update(self._views, graph.poses, everything)
+        found = self._extractor.update(self._fusion, dirty, stamp(keyframe))
         keyframes = tuple(
-            Keyframe(n.stamp_ns, p.x_m, p.y_m, p.yaw_rad, p.scale)
-            for n, p in zip(self._nodes, self._poses, strict=True)
+            Keyframe(stamp(i), p.x_m, p.y_m, p.yaw_rad, p.scale) for i, p in graph.poses.items()
         )
+        sizes = [len(submap.poses) for submap in self._atlas.submaps()]
         funnel: dict[str, float] = {
-            "keyframes": len(self._nodes),
-            "loop_closures": sum(e.loop for e in self._edges),
-            "restarts": self._restarts,
+            "keyframes": len(keyframes),
+            "submaps": sum(size > 1 for size in sizes),
+            "unlinked": sum(size == 1 for size in sizes),
+            "loop_closures": sum(edge.loop for edge in graph.edges),
+            "scale_sigma": graph.scale_sigma(keyframe),
             "buildings": len(found.local_map),
             "cut": int(found.local_map.cut.sum()),
             "redraws_waiting": self._fusion.waiting,
-            **{f"rejected_{reason}": count for reason, count in sorted(self._rejected.items())},
+            **dict(sorted(self._atlas.counts.items())),
             "seconds": time.perf_counter() - started,
         }
-        return MapUpdate(keyframes, found.local_map, found.outlines, funnel)
+        return MapUpdate(keyframes, found.local_map, found.outlines, funnel, tuple(_links(graph)))
 
-    def _link(self, earlier: int, node: _Node, loop: bool = False) -> bool:
-        link = self._registration.register(self._nodes[earlier].prepared, node.prepared)
-        if not isinstance(link, Link):
-            self._rejected[("loop_" if loop else "") + link.reason] += 1
-            return False
-        later = len(self._nodes) - 1 if loop else len(self._nodes)
-        self._edges.append(Edge(earlier, later, link.transform, link.inliers, loop))
-        return True
 
-    def _attach(self, node: _Node) -> bool:
-        """Link a keyframe to the latest one it registers with; the first one starts the map."""
-        latest = len(self._nodes) - 1
-        for earlier in range(latest, max(-1, latest - 1 - self.config.fallback_keyframes), -1):
-            if self._link(earlier, node):
-                self._poses.append(self._poses[earlier].compose(self._edges[-1].transform))
-                self._nodes.append(node)
-                self._lost = 0
-                return True
-        self._lost += 1
-        if self._nodes and self._lost < self.config.max_lost:
-            return False
-        self._restarts += bool(self._nodes)
-        self._start_anew()
-        self._nodes, self._poses = [node], [ORIGIN]
-        return True
-
-    def _close_loops(self) -> None:
-        """Test the spatially nearest keyframes of long ago against the newest one."""
-        newest = len(self._nodes) - 1
-        here = self._poses[newest]
-        distances = sorted(
-            (math.hypot(p.x_m - here.x_m, p.y_m - here.y_m), i)
-            for i, p in enumerate(self._poses[: max(0, newest - self.config.loop_gap + 1)])
-        )
-        near = [i for distance, i in distances if distance <= self.config.loop_radius_m]
-        for earlier in near[: self.config.loop_tests]:
-            self._link(earlier, self._nodes[newest], loop=True)
+def _links(graph: PoseGraph) -> Iterator[tuple[int, int, str]]:
+    """The edges of a graph as MapUpdate tells them: a keyframe's first one is that to its predecessor."""
+    place = {keyframe: i for i, keyframe in enumerate(graph.poses)}
+    linked: set[int] = set()
+    for edge in graph.edges:
+        kind = "loop" if edge.loop else "skip" if edge.later in linked else "consecutive"
+        yield place[edge.earlier], place[edge.later], kind
+        linked.add(edge.later)

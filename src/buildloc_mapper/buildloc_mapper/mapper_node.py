@@ -1,15 +1,17 @@
-"""Images with telemetry and /buildloc/mask in; /buildloc/map and /buildloc/keyframes out."""
+"""Images with telemetry and /buildloc/mask in; /buildloc/map, /buildloc/keyframes and /buildloc/track out."""
 
 from __future__ import annotations
 
 import sys
+import time
 from typing import Any
 
 from buildloc_msgs_py import encode, qos, topics, wire
 from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.ros_node import Diagnostics, FrameAssembler, declare_config, run_node
-from buildloc_msgs_py.types import Frame, Mask
+from buildloc_msgs_py.types import Frame, Keyframe, Mask
 from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Path
 from rclpy.node import Node
 from sensor_msgs.msg import Image, PointCloud2
@@ -18,6 +20,7 @@ from std_srvs.srv import Trigger
 
 from buildloc_mapper.config import MapperConfig
 from buildloc_mapper.mapper import Mapper
+from buildloc_mapper.tracking import Tracked
 
 FRAMES_KEPT = 100  # that wait for a mask; a busy segmenter may lag by seconds
 
@@ -31,9 +34,11 @@ class MapperNode(Node):  # type: ignore[misc]
         self._diagnostics = Diagnostics(self)
         self._frames: dict[int, Frame] = {}
         self._masks: dict[int, Mask] = {}
-        self._received = self._published = self._dropped = 0
+        self._received = self._published = self._dropped = self._tracked = self._lost = 0
+        self._track_after_s = 0.0
         self._map = self.create_publisher(PointCloud2, topics.MAP, qos.SENSOR)
         self._keyframes = self.create_publisher(Path, topics.KEYFRAMES, qos.SENSOR)
+        self._track = self.create_publisher(PoseWithCovarianceStamped, topics.TRACK, qos.SENSOR)
         self._assembler = FrameAssembler(self, self._on_frame, self._diagnostics)
         self.create_subscription(Image, topics.MASK, self._on_mask, qos.SENSOR)
         self.create_service(Trigger, topics.RESET, self._on_reset)
@@ -42,6 +47,26 @@ class MapperNode(Node):  # type: ignore[misc]
     def _on_frame(self, frame: Frame) -> None:
         self._frames[frame.stamp_ns] = frame
         self._add(frame.stamp_ns)
+        self._track_frame(frame)
+
+    def _track_frame(self, frame: Frame) -> None:
+        """Publish where a frame is. At most half of the time goes into this: keyframes come first."""
+        started = time.monotonic()
+        if started < self._track_after_s:
+            return
+        try:
+            answer = self._mapper.track(frame)
+        except BuildlocError as error:
+            self._report(DiagnosticStatus.WARN, str(error))
+            return
+        if isinstance(answer, Tracked):
+            pose, covariance = self._mapper.on_map(answer)
+            self._track.publish(
+                encode.encode_tracked(Keyframe(frame.stamp_ns, *pose), frame.altitude_m, covariance)
+            )
+        self._tracked += isinstance(answer, Tracked)
+        self._lost += not isinstance(answer, Tracked)
+        self._track_after_s = 2.0 * time.monotonic() - started
 
     def _on_mask(self, message: Image) -> None:
         try:
@@ -83,7 +108,10 @@ class MapperNode(Node):  # type: ignore[misc]
         self._report(DiagnosticStatus.OK, "mapping", **update.funnel)
 
     def _report(self, level: bytes, message: str, **figures: float) -> None:
-        counts = {"masks": self._received, "maps": self._published, "masks_without_image": self._dropped}
+        counts = {
+            "masks": self._received, "maps": self._published, "masks_without_image": self._dropped,
+            "frames_tracked": self._tracked, "frames_lost": self._lost,
+        }  # fmt: skip
         self._diagnostics.report(level, message, **counts, **figures)
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

@@ -24,7 +24,7 @@ class Matches:
 
 @dataclass(frozen=True)
 class Described:
-    """Keypoints (N, 2) in pixels of the level image, and descriptors (N, D)."""
+    """Keypoints (N, 2) in pixels of the level image, strongest first, and descriptors (N, D)."""
 
     uv: FloatArray
     descriptors: NDArray[Any]
@@ -78,8 +78,11 @@ class Sift:
         keypoints, descriptors = cv2.SIFT.create(nfeatures=self._features).detectAndCompute(grey, None)
         if descriptors is None:
             return Described(np.empty((0, 2)), np.empty((0, 128), dtype=np.uint8))
-        uv = unfit(np.array([k.pt for k in keypoints]), zoom)
-        return Described(uv, descriptors.astype(np.uint8))  # whole numbers, a quarter of the memory
+        strongest = np.argsort([-k.response for k in keypoints], kind="stable")
+        uv = unfit(np.array([k.pt for k in keypoints]), zoom)[strongest]
+        return Described(
+            uv, descriptors[strongest].astype(np.uint8)
+        )  # whole numbers, a quarter of the memory
 
     def match(self, earlier: Described, later: Described) -> Matches:
         """Nearest neighbours that pass the ratio test, one to one."""

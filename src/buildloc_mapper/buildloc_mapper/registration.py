@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -12,6 +12,7 @@ from buildloc_msgs_py.config import ConfigError
 from buildloc_msgs_py.types import ByteArray, FloatArray, Frame
 from numpy.typing import NDArray
 
+from buildloc_mapper.appearance import LANDMARKS, signature
 from buildloc_mapper.config import MapperConfig
 from buildloc_mapper.level import LevelImage, level_image
 from buildloc_mapper.matching import Matches, Method, Sift
@@ -22,16 +23,43 @@ METHODS = ("sift", "xfeat", "coarse_loftr", "loftr")
 MIN_MATCHES = 3
 RELIEF = 0.1  # standard deviation of the ground's slope, trees and roofs among it
 MAJORITY = 0.5  # share of matches that must agree where tracking does not confirm them
+JPEG_QUALITY = 90
+FOLLOWED = 300  # corners that follow a motion which is known to some pixels
 CELL_SPREAD = 1.0  # inlier distance of matched cells, in cells: both ends are right to half a cell
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """A frame as level ground, the corners (N, 2) px it can be refined by, and the method's features."""
+    """A frame as level ground, the corners (N, 2) px it can be refined by, and the method's features.
+
+    ``signature`` (K, 32) are its most telling features, for :mod:`buildloc_mapper.appearance`.
+    """
 
     level: LevelImage
     corners_uv: FloatArray
     features: Any
+    signature: NDArray[np.float32]
+
+    def packed(self) -> Packed:
+        """The same in the memory that it may take for good."""
+        quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+        _, jpeg = cv2.imencode(".jpg", self.level.grey, quality)
+        nothing = np.empty((0, 0), dtype=np.uint8)
+        level = replace(self.level, grey=nothing)
+        return Packed(np.asarray(jpeg, dtype=np.uint8), replace(self, level=level))
+
+
+@dataclass(frozen=True)
+class Packed:
+    """A prepared frame whose image is compressed."""
+
+    jpeg: ByteArray
+    rest: Prepared
+
+    def unpacked(self) -> Prepared:
+        """The prepared frame; its image has lost what JPEG loses, far below what moves a corner."""
+        grey = np.asarray(cv2.imdecode(self.jpeg, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
+        return replace(self.rest, level=replace(self.rest.level, grey=grey))
 
 
 @dataclass(frozen=True)
@@ -40,7 +68,7 @@ class Link:
 
     Images are already metric by their own altitudes, so the altitude ratio of the pair is divided out: the
     scale is 1 up to errors of altitude and terrain. ``covariance`` (4, 4) is that of the fit, over x, y,
-    yaw, log scale; errors of telemetry are not in it.
+    yaw, log scale; errors of telemetry are not in it (:func:`link_covariance`).
     """
 
     transform: Similarity
@@ -83,17 +111,25 @@ class Registration:
     def __init__(self, config: MapperConfig) -> None:
         self._config = config
         self._method = create_method(config)
+        self._landmarks = Sift(LANDMARKS, config.feature_width_px, config.match_ratio)
 
     def prepare(self, frame: Frame) -> Prepared:
         """Level ground and features of a frame."""
         level = level_image(frame, self._config.level_width_px)
-        return Prepared(level, corners(level), self._method.prepare(level.grey))
+        features = self._method.prepare(level.grey)
+        described = features if isinstance(self._method, Sift) else self._landmarks.prepare(level.grey)
+        return Prepared(level, corners(level), features, signature(described))
 
-    def register(self, earlier: Prepared, later: Prepared) -> Link | Rejection:
-        """The later keyframe's pose in the earlier one, or why the pair is rejected."""
+    def register(
+        self, earlier: Prepared, later: Prepared, turned_rad: float | None = None
+    ) -> Link | Rejection:
+        """The later keyframe's pose in the earlier one, or why the pair is rejected.
+
+        ``turned_rad`` is the turn to try first by methods that know an up; None: the gimbal's.
+        """
         if min(len(earlier.corners_uv), len(later.corners_uv)) < self._config.min_inliers:
             return Rejection("few_matches")
-        turned = _turn_told(earlier.level, later.level)
+        turned = turn_told(earlier.level, later.level) if turned_rad is None else turned_rad
         answers: list[Rejection] = []
         for turn in sorted(self._method.turns, key=lambda turn: (turn - round(turned / (math.pi / 2))) % 4):
             answer = self._estimate(earlier, later, self._matches(earlier, later, turn))
@@ -101,6 +137,15 @@ class Registration:
                 return answer
             answers.append(answer)
         return answers[0]
+
+    def follow(self, earlier: Prepared, later: LevelImage, rough: Similarity) -> Link | Rejection:
+        """The later image's pose in the earlier keyframe where it is known to some 15 pixels, by its corners
+        alone: a fraction of the cost of :meth:`register`."""
+        step = max(1, len(earlier.corners_uv) // FOLLOWED)
+        followed = self._refine(earlier.level, earlier.corners_uv[::step], later, rough)
+        if followed is None:
+            return Rejection("few_inliers")
+        return self._fitted(*followed, rough, len(followed[0]), earlier.level, later)
 
     def _matches(self, earlier: Prepared, later: Prepared, turn: int) -> Matches:
         """Correspondences with the later image turned counter-clockwise by quarter turns."""
@@ -126,25 +171,34 @@ class Registration:
             return Rejection("few_inliers")
         if (wrong := self._implausible(rough, earlier.level, later.level)) is not None:
             return wrong
-        fine = self._refine(earlier, later, rough)
+        fine = self._refine(earlier.level, earlier.corners_uv, later.level, rough)
         if fine is None and (matches.cell_px > 0.0 or count < MAJORITY * len(source)):
             return Rejection("few_inliers")  # too rough to be a measurement, or agreement by chance
         source, target = fine or (source[kept], target[kept])
-        relief = RELIEF / earlier.level.altitude_m
+        return self._fitted(source, target, rough, count, earlier.level, later.level)
+
+    def _fitted(
+        self,
+        source: FloatArray,
+        target: FloatArray,
+        rough: Similarity,
+        count: int,
+        earlier: LevelImage,
+        later: LevelImage,
+    ) -> Link | Rejection:
+        relief = RELIEF / earlier.altitude_m
         transform, covariance = fit_similarity(source, target, np.array(rough[:2]), relief)
-        if (wrong := self._implausible(transform, earlier.level, later.level)) is not None:
-            return wrong
-        return Link(transform, count, covariance)
+        return self._implausible(transform, earlier, later) or Link(transform, count, covariance)
 
     def _refine(
-        self, earlier: Prepared, later: Prepared, rough: Similarity
+        self, earlier: LevelImage, corners_uv: FloatArray, later: LevelImage, rough: Similarity
     ) -> tuple[FloatArray, FloatArray] | None:
-        """Tracked corners (N, 2) of the later and the earlier keyframe that lie on common ground; None
-        when there are too few."""
-        target, source = track(earlier.level, earlier.corners_uv, later.level, rough)
+        """Tracked corners (N, 2) of the later and the earlier image that lie on common ground; None when
+        there are too few."""
+        target, source = track(earlier, corners_uv, later, rough)
         if len(source) < self._config.min_inliers:
             return None
-        threshold_m = self._config.refined_threshold_px * earlier.level.gsd_m
+        threshold_m = self._config.refined_threshold_px * earlier.gsd_m
         _, kept = robust_similarity(source, target, threshold_m)
         return (source[kept], target[kept]) if kept.sum() >= self._config.min_inliers else None
 
@@ -152,10 +206,22 @@ class Registration:
         """A transform that telemetry contradicts. The scale is what the two altitudes do not explain."""
         if abs(found.scale - 1.0) > self._config.max_scale_deviation:
             return Rejection("scale")
-        deviation = math.remainder(found.yaw_rad - _turn_told(earlier, later), math.tau)
+        deviation = math.remainder(found.yaw_rad - turn_told(earlier, later), math.tau)
         if abs(deviation) > math.radians(self._config.max_yaw_deviation_deg):
             return Rejection("yaw")
         return None
+
+
+def link_covariance(link: Link, config: MapperConfig) -> FloatArray:
+    """(4, 4) over x, y, yaw, log scale: what the fit knows of its pixels, and what it does not know (relief,
+    lens, attitude), which shrinks with the inliers."""
+    unknown = np.square(
+        [
+            config.sigma_position_m, config.sigma_position_m,
+            math.radians(config.sigma_rotation_deg), config.sigma_log_scale,
+        ]
+    )  # fmt: skip
+    return np.asarray(link.covariance + np.diag(unknown) * config.min_inliers / link.inliers)
 
 
 def robust_similarity(
@@ -177,7 +243,7 @@ def robust_similarity(
     return Similarity(float(affine[0, 2]), float(affine[1, 2]), yaw, scale), inliers.ravel() > 0
 
 
-def _turn_told(earlier: LevelImage, later: LevelImage) -> float:
+def turn_told(earlier: LevelImage, later: LevelImage) -> float:
     """Yaw of the later camera in the earlier one by the gimbal, radians, counter-clockwise."""
     return earlier.heading_rad - later.heading_rad
 

@@ -160,7 +160,7 @@ def test_distortion_is_taken_out_before_registration(distortion: tuple[float, ..
     assert np.allclose(bent.transform, clean.transform, atol=0.05)
     ignored = [replace(frame, camera=replace(frame.camera, distortion=())) for frame in frames]
     wrong = registered(*ignored, MapperConfig())
-    assert isinstance(wrong, Rejection) or not np.allclose(wrong.transform, clean.transform, atol=0.2)
+    assert isinstance(wrong, Rejection) or not np.allclose(wrong.transform, clean.transform, atol=0.1)
 
 
 def test_camera_info_may_change_in_flight() -> None:

@@ -54,6 +54,14 @@ def test_a_noisy_map_is_located_within_5_m(seed: int, count: int) -> None:
     assert np.hypot(*(place - seen.true_m[0])) < 12.0
 
 
+def test_cut_buildings_are_left_out() -> None:
+    seen = observed(TOWN, 60, 1, 0).local_map
+    cut = np.arange(60) % 5 == 0
+    found = Matcher(HERE, DEFAULT).locate(replace(seen, cut=cut))
+    without = Matcher(HERE, DEFAULT).locate(seen.select(~cut))
+    assert found.candidates == without.candidates and found.funnel["buildings"] == 48
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_the_wrong_town_gives_no_fix_and_says_why(seed: int) -> None:
     seen = observed(TOWN, 60, 1, seed)

@@ -30,12 +30,15 @@ from buildloc_msgs_py.types import (
     CameraModel,
     Candidate,
     Fix,
+    FloatArray,
     Keyframe,
     LocalMap,
     Mask,
     NoFix,
 )
 from buildloc_msgs_py.wire import CANDIDATE_ROW, MAP_ROW, POINT_TYPES
+
+LEVEL_SIGMA_RAD = math.radians(5.0)
 
 
 def header(stamp_ns: int, frame_id: str) -> Header:
@@ -112,6 +115,22 @@ def encode_keyframes(keyframes: Sequence[Keyframe]) -> Path:
     return path
 
 
+def encode_tracked(pose: Keyframe, height_m: float, covariance: FloatArray) -> PoseWithCovarianceStamped:
+    """A frame's pose in ``buildloc_map``, ``height_m`` above ground at unit scale; its (4, 4) covariance is
+    over x, y, yaw and log scale. Roll and pitch are the gimbal's, which are taken out."""
+    message = PoseWithCovarianceStamped(header=header(pose.stamp_ns, topics.FRAME_MAP))
+    height = height_m * pose.scale
+    message.pose.pose.position.x, message.pose.pose.position.y = float(pose.x_m), float(pose.y_m)
+    message.pose.pose.position.z = float(height)
+    message.pose.pose.orientation = _yaw_quaternion(pose.yaw_rad)
+    to_message = np.zeros((6, 4))  # x, y, z, and turns about the three axes
+    to_message[[0, 1, 2, 5], [0, 1, 3, 2]] = 1.0, 1.0, height, 1.0
+    spread = to_message @ covariance @ to_message.T
+    spread[3, 3] = spread[4, 4] = LEVEL_SIGMA_RAD**2
+    message.pose.covariance = [float(v) for v in spread.ravel()]
+    return message
+
+
 def encode_cloud(rows: NDArray[np.void], stamp_ns: int, frame_id: str) -> PointCloud2:
     """(N,) rows of a structured array -> PointCloud2, a field per column."""
     count, step = len(rows), int(rows.dtype.itemsize)
@@ -172,6 +191,6 @@ def encode_pose(fix: Fix) -> PoseWithCovarianceStamped:
     msg.pose.pose.orientation = _yaw_quaternion(fix.yaw_rad)
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = fix.covariance_enu_m2
-    covariance[3, 3] = covariance[4, 4] = covariance[5, 5] = math.radians(5.0) ** 2
+    covariance[3, 3] = covariance[4, 4] = covariance[5, 5] = LEVEL_SIGMA_RAD**2
     msg.pose.covariance = [float(v) for v in covariance.ravel()]
     return msg

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -58,6 +59,17 @@ def level_matrix(attitude_xyzw: Quaternion) -> FloatArray:
 def camera_matrix(camera: CameraModel) -> FloatArray:
     """(3, 3) intrinsic matrix."""
     return np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+
+
+def resized(camera: CameraModel, zoom: float) -> CameraModel:
+    """The camera of an image that was shrunk or enlarged by ``zoom``, to whole pixels."""
+    width, height = round(camera.width * zoom), round(camera.height * zoom)
+    zoom_u, zoom_v = width / camera.width, height / camera.height
+    # Pixel centres are whole numbers, so shrinking maps u to (u + 0.5) zoom - 0.5.
+    return replace(
+        camera, width=width, height=height, fx=camera.fx * zoom_u, fy=camera.fy * zoom_v,
+        cx=(camera.cx + 0.5) * zoom_u - 0.5, cy=(camera.cy + 0.5) * zoom_v - 0.5,
+    )  # fmt: skip
 
 
 def _rays(uv: FloatArray, camera: CameraModel) -> FloatArray:

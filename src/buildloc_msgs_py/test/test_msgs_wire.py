@@ -219,6 +219,22 @@ def test_no_fix_has_no_position(travel: Travel) -> None:
 
 
 @wires
+def test_tracked(travel: Travel) -> None:
+    spread = np.random.default_rng(2).normal(size=(4, 4)) * 0.1
+    covariance = spread @ spread.T  # x, y, yaw, log scale
+    message = travel(encode.encode_tracked(Keyframe(STAMP, 12.0, -3.0, 0.5, 1.02), 100.0, covariance))
+    assert (wire.stamp_ns(message), message.header.frame_id) == (STAMP, "buildloc_map")
+    position, turn = message.pose.pose.position, message.pose.pose.orientation
+    assert (position.x, position.y, position.z) == pytest.approx((12.0, -3.0, 102.0))
+    assert 2.0 * np.arctan2(turn.z, turn.w) == pytest.approx(0.5)
+    six = np.reshape(message.pose.covariance, (6, 6))
+    assert six[:2, :2] == pytest.approx(covariance[:2, :2])
+    assert six[5, 5] == pytest.approx(covariance[2, 2]) and six[0, 5] == pytest.approx(covariance[0, 2])
+    assert six[2, 2] == pytest.approx(102.0**2 * covariance[3, 3])
+    assert np.linalg.eigvalsh(six).min() > -1e-9
+
+
+@wires
 def test_pose(travel: Travel) -> None:
     message = travel(encode.encode_pose(FIX))
     assert message.header.frame_id == "map"

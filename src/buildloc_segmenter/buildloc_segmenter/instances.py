@@ -62,13 +62,12 @@ def find_instances(
     mask = fill_holes((building > 0.0).astype(np.uint8), min_px)
     cores = _cores(mask, core, gsd_m)
     grown = _flood(mask, _markers(mask, cores, MIN_CORE_M2 / gsd_m**2))
-    labels = np.where(mask > 0, grown, 0)
-    kept = np.bincount(labels.ravel(), minlength=1) >= max(min_px, 1.0)
+    kept = np.bincount((grown * mask).ravel()) >= max(min_px, 1.0)
     kept[0] = False
-    number = np.where(kept, np.cumsum(kept), 0).astype(np.int32)
+    grown = np.take(np.where(kept, np.cumsum(kept), 0).astype(np.int32), grown)
     gap_m = max(GAP_M, GAP_PX * image_gsd_m)
-    between = _between(number[grown], max(1, round(0.5 * gap_m / gsd_m)))
-    return Instances(number[labels], building, between, gsd_m)
+    between = _between(grown, max(1, round(0.5 * gap_m / gsd_m)))
+    return Instances(grown * mask, building, between, gsd_m)
 
 
 def _cores(mask: ByteArray, core: FloatImage | None, gsd_m: float) -> ByteArray:
@@ -77,17 +76,24 @@ def _cores(mask: ByteArray, core: FloatImage | None, gsd_m: float) -> ByteArray:
     return (cv2.distanceTransform(mask, cv2.DIST_L2, 3) * gsd_m > CORE_INSET_M).astype(np.uint8)
 
 
+def _components(mask: ByteArray, connectivity: int) -> tuple[int, LabelImage]:
+    """How many connected components, the background among them, and the number of each pixel's."""
+    count, labels = cv2.connectedComponents(mask, connectivity=connectivity)
+    return count, np.asarray(labels, dtype=np.int32)
+
+
 def _markers(mask: ByteArray, cores: ByteArray, min_core_px: float) -> LabelImage:
     """(h, w) 0 where the watershed decides, else a number above GROUND per building to be."""
-    count, markers, stats, _ = cv2.connectedComponentsWithStats(cores, connectivity=4)
-    real = stats[:, cv2.CC_STAT_AREA] >= min_core_px
-    real[0] = False
-    markers = np.where(real, np.arange(count, dtype=np.int32) + GROUND, 0)[markers]
-    parts, part = cv2.connectedComponents(mask, connectivity=8)
-    bare = np.ones(parts, dtype=bool)
-    bare[part[markers > 0]] = False
-    bare[0] = False
-    return np.where(bare[part], part + np.int32(count + GROUND), markers)
+    count, markers = _components(cores, 4)
+    number = np.arange(count, dtype=np.int32) + GROUND
+    number[np.bincount(markers.ravel(), minlength=count) < min_core_px] = 0
+    number[0] = 0
+    markers = np.take(number, markers)
+    parts, part = _components(mask, 8)
+    bare = np.arange(parts, dtype=np.int32) + (count + GROUND)
+    bare[np.bincount((part * (markers > 0)).ravel(), minlength=parts) > 0] = 0
+    bare[0] = 0
+    return np.maximum(markers, np.take(bare, part)) if bare.any() else markers
 
 
 def _flood(mask: ByteArray, markers: LabelImage) -> LabelImage:
@@ -112,12 +118,12 @@ def _between(labels: LabelImage, reach_px: int) -> NDArray[np.bool_]:
 
 def fill_holes(mask: ByteArray, max_px: float) -> ByteArray:
     """(h, w) 0 or 1, with the holes below ``max_px`` filled: background that is enclosed by building."""
-    height, width = mask.shape
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(1 - mask, connectivity=4)
-    x, y, w, h, area = stats.T
-    hole = (area < max_px) & (x > 0) & (y > 0) & (x + w < width) & (y + h < height)
-    hole[0] = False
-    return np.asarray(mask | hole[labels], dtype=np.uint8)
+    count, labels = _components(1 - mask, 4)
+    hole = (np.bincount(labels.ravel(), minlength=count) < max_px).astype(np.uint8)
+    for border in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
+        hole[border] = 0
+    hole[0] = 0
+    return mask | np.take(hole, labels) if hole.any() else mask
 
 
 def draw_mask(instances: Instances, size: tuple[int, int]) -> ByteArray:

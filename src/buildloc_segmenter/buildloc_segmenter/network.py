@@ -201,11 +201,15 @@ class Network:
         """The side, rounded up to what the network takes."""
         return math.ceil(side / self.contract.input_multiple) * self.contract.input_multiple
 
+    def _tile_side(self, size: int) -> int:
+        """The side of as few equal tiles as cover ``size`` pixels: no larger than their overlap asks for."""
+        count = max(1, math.ceil((size - OVERLAP_PX) / (self._whole(TILE_PX) - OVERLAP_PX)))
+        return self._whole(math.ceil((size + (count - 1) * OVERLAP_PX) / count))
+
     def _logits(self, image_bgr: ByteArray) -> FloatImage:
         """(1 or 2, rows, columns) logits of building and core; tiles are averaged where they overlap."""
         rows, columns = image_bgr.shape[:2]
-        largest = self._whole(TILE_PX)
-        tile = self._fixed or (min(self._whole(rows), largest), min(self._whole(columns), largest))
+        tile = self._fixed or (self._tile_side(rows), self._tile_side(columns))
         height, width = max(rows, tile[0]), max(columns, tile[1])
         border = (0, height - rows, 0, width - columns)
         padded = np.asarray(cv2.copyMakeBorder(image_bgr, *border, cv2.BORDER_REPLICATE), dtype=np.uint8)
