@@ -173,7 +173,7 @@ def _observe_along(
     extras = round(len(rows) * extra_share / (1.0 - extra_share))
     if len(rows) + extras < count:
         return None
-    true = reference.centroids_m[rows] + _offsets(len(rows), digitiser, rng)
+    true = reference.centroids_m[rows] + digitising_offsets(len(rows), digitiser, rng)
     extra_at = rng.integers(0, int(along.max()) + 1, extras)
     extra = path[extra_at] + rng.uniform(-HALF_SWATH_M, HALF_SWATH_M, (extras, 2))
     like = rng.integers(0, len(rows), extras)  # as large and as shaped as their neighbours
@@ -203,7 +203,8 @@ def _observe_along(
     return ObservedMap(local_map, true, float(along.max()) * STEP_M)
 
 
-def _offsets(count: int, digitiser: Digitiser, rng: np.random.Generator) -> FloatArray:
+def digitising_offsets(count: int, digitiser: Digitiser, rng: np.random.Generator) -> FloatArray:
+    """(count, 2) between the centroids of a building in two sources, m."""
     length = digitiser.offset_median_m * np.exp(rng.normal(0.0, digitiser.offset_log_sigma, count))
     angle = rng.uniform(-math.pi, math.pi, count)
     return np.column_stack([length * np.cos(angle), length * np.sin(angle)])

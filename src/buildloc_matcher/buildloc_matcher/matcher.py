@@ -31,11 +31,13 @@ MOST_STARS = 4096  # of one look; those of a map of 100,000 buildings, matched, 
 
 @dataclass(frozen=True)
 class MatchResult:
-    """Candidates, best first, with their scores in the same order; the funnel counts what came of the
-    stars, and ``seconds`` tells how long each stage took."""
+    """Candidates, best first, with their scores in the same order; the places (C, 2) m of all bins with
+    consistent votes, most votes first; the funnel counts what came of the stars, and ``seconds`` tells how
+    long each stage took."""
 
     candidates: tuple[Candidate, ...]
     scores: tuple[Score, ...]
+    voted_m: FloatArray
     query: QueryMap | None
     funnel: dict[str, float]
     seconds: dict[str, float]
@@ -119,21 +121,18 @@ class Matcher:
             local_map.shapes[usable],
         )
         if len(points) < FEWEST_BUILDINGS:
-            return MatchResult((), (), None, {"buildings": len(points)}, clock.seconds)
+            return MatchResult((), (), np.empty((0, 2)), None, {"buildings": len(points)}, clock.seconds)
         query = query_map(points, areas)
         for number, look in enumerate(self._looks, start=1):
             with clock.stage("describe"):
                 found = mesh(points, areas, shapes, look.thinnings, look.max_stars)
-            candidates, scores, funnel = self._look(found, look.star_matcher, query, clock)
-            funnel |= {"buildings": len(points), "looks": number}
-            result = MatchResult(candidates, scores, query, funnel, clock.seconds)
+            result = self._look(found, look.star_matcher, query, clock)
+            result = replace(result, funnel=result.funnel | {"buildings": len(points), "looks": number})
             if self.refuse(result) is None:
                 break
         return result
 
-    def _look(
-        self, found: Mesh, star_matcher: StarMatcher, query: QueryMap, clock: _Clock
-    ) -> tuple[tuple[Candidate, ...], tuple[Score, ...], dict[str, float]]:
+    def _look(self, found: Mesh, star_matcher: StarMatcher, query: QueryMap, clock: _Clock) -> MatchResult:
         """Once from stars to ranked candidates."""
         config, reference = self.config, self.database.ground
         centre = query.points_m.mean(axis=0)
@@ -168,7 +167,8 @@ class Matcher:
         if candidates:
             funnel["lead"] = lead(candidates[0], candidates[1:], config)
             funnel["log_odds"] = candidates[0].acceptance
-        return candidates, tuple(score for _, score in selected), funnel
+        scores = tuple(score for _, score in selected)
+        return MatchResult(candidates, scores, ballot.places_m, query, funnel, clock.seconds)
 
     def _candidate(self, cluster: Cluster, score: Score, centre: FloatArray, query: QueryMap) -> Candidate:
         near = local_transform(score, centre, query, self.database.ground, self.config)

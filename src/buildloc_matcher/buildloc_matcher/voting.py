@@ -30,11 +30,17 @@ class Cluster:
 
 @dataclass(frozen=True)
 class Ballot:
-    """The ``top_k`` clusters by falling votes, the number of bins hit and of bins with a consistent one."""
+    """The ``top_k`` clusters by falling votes, the number of bins hit, and the places (C, 2) m of all
+    consistent clusters in the same order."""
 
     clusters: tuple[Cluster, ...]
     bins: int
-    consistent: int
+    places_m: FloatArray
+
+    @property
+    def consistent(self) -> int:
+        """Number of bins with a consistent cluster."""
+        return len(self.places_m)
 
 
 @njit(nogil=True, cache=True)
@@ -77,7 +83,7 @@ def _clusters(starts, positions, yaws, scales, weights, tolerance, out):  # type
 def vote(hypotheses: Hypotheses, config: MatcherConfig) -> Ballot:
     """One cluster per bin; bins with fewer than ``min_votes`` consistent votes have none."""
     if len(hypotheses) == 0:
-        return Ballot((), 0, 0)
+        return Ballot((), 0, np.empty((0, 2)))
     keys = np.round(hypotheses.positions_m / config.bin_size_m).astype(np.int64)
     order = np.lexsort((keys[:, 1], keys[:, 0]))
     changes = np.flatnonzero(np.any(np.diff(keys[order], axis=0), axis=1)) + 1
@@ -93,4 +99,4 @@ def vote(hypotheses: Hypotheses, config: MatcherConfig) -> Ballot:
         Cluster(x, y, yaw, scale, votes, int(members), int(order[int(best)]))
         for x, y, yaw, scale, votes, members, best in ranked[: config.top_k].tolist()
     )
-    return Ballot(clusters, len(table), len(consistent))
+    return Ballot(clusters, len(table), ranked[:, :2])

@@ -188,7 +188,7 @@ def test_without_clusters_there_is_no_candidate() -> None:
     none = np.empty(0)
     nobody = Hypotheses(none.astype(int), np.empty((0, 3, 2)), np.empty((0, 2)), none, none, none, 0, 0)
     for config in (DEFAULT, PAPER):
-        assert select(Ballot((), 0, 0), nobody, MIDDLE[None], MAP, GROUND, config) == []
+        assert select(Ballot((), 0, np.empty((0, 2))), nobody, MIDDLE[None], MAP, GROUND, config) == []
 
 
 def test_a_match_of_fewer_than_three_scores_as_its_cluster() -> None:

@@ -100,6 +100,7 @@ def test_fewest_votes_and_the_number_listed() -> None:
     ballot = vote(found, replace(CONFIG, min_votes=3, top_k=2))
     assert (ballot.bins, ballot.consistent) == (5, 3)
     assert [(c.x_m, c.members) for c in ballot.clusters] == [(400.0, 5), (300.0, 4)]
+    assert ballot.places_m.tolist() == [[400.0, 0.0], [300.0, 0.0], [200.0, 0.0]]
 
 
 def test_ties_are_ranked_from_west_and_south_whatever_the_order() -> None:

@@ -1,0 +1,138 @@
+"""The methods compared, each from maps to ranked places. None of them sees the truth."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from buildloc_matcher.config import matcher_config
+from buildloc_matcher.matcher import Matcher, MatchResult
+from buildloc_matcher.reference.buildings import Buildings
+from buildloc_matcher.reference.database import ReferenceDatabase, assemble
+from buildloc_matcher.refinement import refine
+from buildloc_matcher.session import frames_kept
+from buildloc_msgs_py.errors import BuildlocError
+from buildloc_msgs_py.types import FloatArray
+from numpy.typing import NDArray
+
+from buildloc_eval.paper import brm
+from buildloc_eval.paper.flights import EPSG
+from buildloc_eval.paper.flown import Maps, Snapshot
+from buildloc_eval.scale import method
+
+# How the method is called here -> in eval scale. The second is the paper's "Ours".
+STARS = {
+    "default preset": "default",
+    "paper preset": "paper",
+    "without shape": "shape-free 8-D",
+}
+BRM = "BRM"
+# What stands in the paper's table where these stand in ours.
+PUBLISHED = {
+    "default preset": "ours",
+    "paper preset": "ours",
+    "without shape": "ours without shape",
+    BRM: BRM,
+}
+LISTED = 2000  # bins of a ranking that are kept
+KEPT = 10  # places
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A ranking: the first places (K, 2), where ``centre_m`` of the map lies, or the last camera where that
+    is None; the voting bins (B, 2) in their order, LISTED at most; the refined place of the last camera, or
+    None; why it is no fix, None where it is one; seconds per stage and the funnel."""
+
+    places_m: FloatArray
+    centre_m: FloatArray | None
+    bins: NDArray[np.int32]
+    final_m: FloatArray | None
+    refused: str | None
+    seconds: Mapping[str, float]
+    funnel: Mapping[str, float]
+
+
+def nothing(reason: str) -> Prediction:
+    """No place."""
+    return Prediction(np.empty((0, 2)), None, np.empty((0, 2), np.int32), None, reason, {}, {})
+
+
+def reference_within(buildings: Buildings, centre_m: FloatArray, radius_km: float) -> ReferenceDatabase:
+    """The database of a search radius, in memory."""
+    inside = np.hypot(*(buildings.centroids_m - centre_m).T) <= 1000.0 * radius_km
+    return assemble(EPSG, buildings.select(inside), matcher_config())
+
+
+def make_matcher(name: str, database: ReferenceDatabase) -> Matcher:
+    """A method that matches stars, warm."""
+    matcher = method(STARS[name], database)
+    matcher.warm_up()
+    return matcher
+
+
+def ranked_bins(found: MatchResult, bin_m: float) -> NDArray[np.int32]:
+    """(B, 2) bins as the method ranks them: those of its candidates, then all others by their votes."""
+    places = np.concatenate(
+        [np.array([[c.x_m, c.y_m] for c in found.candidates]).reshape(-1, 2), found.voted_m]
+    )
+    bins = np.round(places / bin_m).astype(np.int32)
+    _, first = np.unique(bins, axis=0, return_index=True)
+    return bins[np.sort(first)[:LISTED]]
+
+
+def locate(matcher: Matcher, maps: Maps, keyframes: int, final: bool) -> Prediction:
+    """The ranking after so many keyframes, with the refined place of the last one if ``final``."""
+    snapshot = maps.snapshots[keyframes - 1]
+    if snapshot is None:
+        return nothing("keyframe links to none of the latest keyframes")
+    try:
+        found = matcher.locate(snapshot.local_map)
+    except BuildlocError as error:
+        return nothing(str(error))
+    if found.query is None:
+        return nothing("map has fewer than four buildings")
+    places = np.array([[c.x_m, c.y_m] for c in found.candidates[:KEPT]]).reshape(-1, 2)
+    centre, bins = found.query.points_m.mean(axis=0), ranked_bins(found, matcher.config.bin_size_m)
+    seconds = dict(found.seconds)
+    refined = None
+    if final and found.candidates:
+        started = time.perf_counter()
+        refined = _refined(matcher, found, maps, snapshot, keyframes)
+        seconds["refine"] = time.perf_counter() - started
+    return Prediction(places, centre, bins, refined, matcher.refuse(found), seconds, found.funnel)
+
+
+def _refined(
+    matcher: Matcher, found: MatchResult, maps: Maps, snapshot: Snapshot, keyframes: int
+) -> FloatArray | None:
+    last = max(snapshot.keyframes, key=lambda k: k.stamp_ns)
+    coarse = matcher.place(found, np.array([last.x_m, last.y_m]))
+    seen = maps.observations[:keyframes][-frames_kept(matcher.config) :]
+    refined = refine(coarse, snapshot.keyframes, seen, matcher.database.ground, matcher.config)
+    return None if refined is None else refined.position_m
+
+
+def brm_survivors(reference: brm.RatioMap, maps: Maps) -> tuple[brm.Survivors, float]:
+    """What BRM makes of a whole flight, and its seconds; the odometry is the mapper's."""
+    started = time.perf_counter()
+    snapshot = maps.snapshots[-1]
+    if snapshot is None:
+        return brm.Survivors(np.empty((0, 2)), np.empty(0)), 0.0
+    path = np.array([[k.x_m, k.y_m] for k in snapshot.keyframes])
+    used = brm.used_keyframes(path)
+    ratios = maps.ratios[np.array(snapshot.numbers)[used]]
+    return brm.search(reference, ratios, path[used]), time.perf_counter() - started
+
+
+def brm_prediction(
+    found: brm.Survivors, seconds: float, centre_m: FloatArray, radius_km: float
+) -> Prediction:
+    """Hypotheses of the largest radius are independent: those of a smaller one are those inside."""
+    places = found.ranked(centre_m, 1000.0 * radius_km)
+    return Prediction(
+        places, None, np.empty((0, 2), np.int32), None, None if len(places) else "no hypothesis survives",
+        {"search": seconds}, {"survivors": float(len(found.residuals))},
+    )  # fmt: skip

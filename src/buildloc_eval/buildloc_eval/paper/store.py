@@ -1,0 +1,87 @@
+"""What was computed, kept in files; what another configuration or another code computed is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+import os
+import pickle
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from buildloc_msgs_py.errors import BuildlocError
+
+MANIFEST = "made_by.json"
+
+
+class StaleError(BuildlocError):
+    """Kept results are of another configuration or code."""
+
+
+def code_hash(modules: Sequence[str]) -> str:
+    """Of the source of modules, and of all the modules of the packages among them."""
+    digest = hashlib.sha256()
+    for name in sorted(modules):
+        file = Path(str(importlib.import_module(name).__file__))
+        for path in sorted(file.parent.rglob("*.py")) if file.name == "__init__.py" else [file]:
+            digest.update(path.name.encode() + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def described(*configs: Any) -> Any:
+    """Config dataclasses as JSON has them."""
+    return json.loads(json.dumps([asdict(config) for config in configs]))
+
+
+class Store:
+    """A folder of results that one configuration and one code made, each written at once.
+
+    Raises StaleError when the folder holds those of another: what it was made by is compared in full.
+    """
+
+    def __init__(self, folder: Path, made_by: dict[str, Any]) -> None:
+        self.folder, self.made_by = folder, made_by
+        folder.mkdir(parents=True, exist_ok=True)
+        manifest = folder / MANIFEST
+        if manifest.is_file():
+            kept = json.loads(manifest.read_text())
+            different = [name for name in made_by if kept.get(name) != made_by[name]]
+            if different:
+                raise StaleError(
+                    f"{folder}: was made with another {', '.join(different)}; choose another --out, or "
+                    "remove the folder to compute it anew"
+                )
+        else:
+            _write(manifest, json.dumps(made_by, indent=1).encode())
+
+    def path(self, name: str) -> Path:
+        """Where a result is kept."""
+        return self.folder / f"{name}.pickle"
+
+    def has(self, name: str) -> bool:
+        """Whether a result is there."""
+        return self.path(name).is_file()
+
+    def load(self, name: str) -> Any:
+        """A result that is there."""
+        return pickle.loads(self.path(name).read_bytes())
+
+    def save(self, name: str, value: Any) -> None:
+        """Keep a result."""
+        _write(self.path(name), pickle.dumps(value))
+
+    def get(self, name: str, make: Callable[[], Any]) -> Any:
+        """The result, made if it is not there."""
+        if not self.has(name):
+            self.save(name, make())
+        return self.load(name)
+
+
+def _write(path: Path, data: bytes) -> None:
+    """All or nothing, for a run that is killed to go on from what is there."""
+    staged = path.with_suffix(f".{os.getpid()}.part")
+    staged.write_bytes(data)
+    os.replace(staged, path)
