@@ -193,7 +193,7 @@ def run_case(case: Case, plan: Plan, imagery: Path, out: Path, progress: Progres
     report = {
         "place": case.place,
         "model": case.model or "shipped",
-        "trained on": training or "the file does not say: make sure that it is other ground than this place",
+        "trained on": training or "its file does not say",
         "all scenes": scores_of(everything),
         "scenes": scenes,
         "disturbed input": robustness(network, widest, progress),
@@ -251,8 +251,12 @@ def evaluate(out: Path, plan: Plan, progress: Progress) -> str:
     pictures = [picture for result in results for picture in result.pictures]
     write_report(out / "report.html", "Segmentation of ground never seen", report, pictures)
     if plan.errors is not None:
-        about = {key: report[key] for key in ("what is real", "what trained", "seed", "quick", "date")}
-        write_errors(plan.errors, about, errors)
+        # It ships: files by their names, not by where they lay here.
+        names = {
+            f"{Path(r.report['model']).name}, {r.report['place']}": r.report["trained on"] for r in results
+        }
+        about = {key: report[key] for key in ("what is real", "seed", "quick", "date")}
+        write_errors(plan.errors, about | {"network, place: what trained it": names}, errors)
     return "\n".join([table([r.report for r in results]), *speed_table(speeds), *summary(errors)])
 
 
