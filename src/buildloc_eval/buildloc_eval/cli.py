@@ -152,7 +152,7 @@ def run_demo(args: argparse.Namespace) -> int:
 def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `buildloc eval`."""
     parser.add_argument(
-        "name", choices=["barnarp", "mapping", "scale", "segmentation"], help="which evaluation"
+        "name", choices=["barnarp", "mapping", "paper", "scale", "segmentation"], help="which evaluation"
     )
     parser.add_argument(
         "-o", "--out", type=Path, required=True, help="folder for report.json and report.html"
@@ -203,6 +203,10 @@ def run_eval(args: argparse.Namespace) -> int:
         from buildloc_eval import mapping
 
         print(mapping.evaluate(args.out, args.seed, args.quick, _stage))
+    elif args.name == "paper":
+        from buildloc_eval.paper import evaluate as paper
+
+        print(paper.evaluate(args.out, args.seed, args.quick, _stage))
     elif args.name == "segmentation":
         from buildloc_eval import segmentation
 

@@ -17,6 +17,8 @@ STYLE = (
 def _cell(value: Any) -> str:
     if isinstance(value, dict):
         return _table(value)
+    if isinstance(value, list) and value and all(isinstance(row, dict) for row in value):
+        return _rows(value)
     if isinstance(value, float):
         return f"{value:.4g}"
     return html.escape("none" if value is None else str(value))
@@ -25,6 +27,16 @@ def _cell(value: Any) -> str:
 def _table(values: dict[str, Any]) -> str:
     rows = "".join(f"<tr><th>{html.escape(str(k))}</th><td>{_cell(v)}</td></tr>" for k, v in values.items())
     return f"<table>{rows}</table>"
+
+
+def _rows(rows: list[dict[str, Any]]) -> str:
+    """A table with a column for every key."""
+    keys = list(dict.fromkeys(key for row in rows for key in row))
+    head = "".join(f"<th>{html.escape(str(key))}</th>" for key in keys)
+    body = "".join(
+        "<tr>" + "".join(f"<td>{_cell(row.get(key))}</td>" for key in keys) + "</tr>" for row in rows
+    )
+    return f"<table><tr>{head}</tr>{body}</table>"
 
 
 def write_report(

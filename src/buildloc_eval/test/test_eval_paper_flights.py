@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import shapely
+from buildloc_eval.flight import margin_m
 from buildloc_eval.observation import Digitiser
+from buildloc_eval.paper import texture
 from buildloc_eval.paper.differences import (
     AutomaticMapping,
     in_strips,
@@ -22,15 +26,18 @@ from buildloc_eval.paper.flights import (
     SiteError,
     choose,
     environment,
+    flight_config,
     keyframe_stamps,
     paper_flights,
     trajectory,
     wanted_environment,
 )
+from buildloc_eval.paper.plan import Models
 from buildloc_eval.paper.published import FLIGHTS, LARGE_RADII_KM, RADII_KM, RECALL
 from buildloc_eval.paper.sources import read_boston
-from buildloc_eval.paper.texture import MirroredGround, mirrored
 from buildloc_eval.realworld import DataError, data_folder
+from buildloc_eval.segmentation_errors import SegmentationErrors
+from buildloc_eval.world import PictureWorld
 from numpy.testing import assert_allclose
 from scipy.spatial import cKDTree
 
@@ -163,14 +170,24 @@ def test_the_reference_lacks_what_another_digitiser_and_automatic_mapping_lack()
     assert len(found) == pytest.approx(0.79 * 0.97 * len(true), rel=0.03)
 
 
-def test_the_ground_is_mirrored_at_the_edges_of_the_picture() -> None:
-    assert mirrored(-2, 6, 3).tolist() == [1, 0, 0, 1, 2, 2, 1, 0]
-    image = np.zeros((2, 3, 3), dtype=np.uint8)
-    image[..., 0] = [[1, 2, 3], [4, 5, 6]]
-    ground = MirroredGround(image, 1.0, 100.0, 50.0)
-    window = ground.window((102.0, 47.0, 105.0, 50.0))
-    assert (window.left_m, window.top_m) == (102.0, 50.0)
-    assert window.image_bgr[..., 0].tolist() == [[3, 3, 2], [6, 6, 5], [6, 6, 5]]
+def test_the_texture_lies_under_the_whole_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    picture = PictureWorld(np.zeros((80, 100, 3), dtype=np.uint8), 32633, 5e5, 6e6, 10.0)
+    monkeypatch.setattr(texture, "GROUNDS", (lambda _: SimpleNamespace(picture=picture),))
+    flight = paper_flights()[5]
+    west, south, east, north = texture.ground_texture(Path(), flight, np.random.default_rng(1)).bounds_m
+    path, reach = trajectory(flight, 1).xy_m, margin_m(flight_config(flight.like))
+    assert (path - reach > (west, south)).all() and (path + reach < (east, north)).all()
+
+
+def test_snow_is_more_false_buildings() -> None:
+    errors = SegmentationErrors(
+        1, 0.1, 0.0, 0.0, 100.0, 0.2, 20.0, 0.5, 0.0, 0.2, (0.0, 0.0, 0.0, 0.0), 0.5, 1, 0.1, 0.2, 0.5
+    )
+    models, flights = Models(errors), paper_flights()
+    snowy = models.errors(flights[6])
+    assert models.errors(flights[0]) == errors
+    assert (snowy.false_per_km2, snowy.false_median_m2) == (300.0, 60.0)
+    assert snowy.missed == errors.missed
 
 
 @pytest.mark.data

@@ -18,12 +18,13 @@ from buildloc_msgs_py.ground import Quaternion, pixels_to_level
 from buildloc_msgs_py.types import ByteArray, CameraModel, FloatArray
 from numpy.typing import NDArray
 
-Outlines = NDArray[np.object_]
+from buildloc_eval.segmentation_errors import Outlines
+
 CELL_M = 10.0
 RASTER_M = 2.5  # of the footprints, before they are averaged over half a cell
-HEADINGS = 120
+HEADINGS = 240
 STEP_M = 50.0  # between the keyframes used: regions of 40 m then overlap little
-TOLERANCE_CELLS = 2  # of odometry and of the steps in heading
+TOLERANCE_CELLS = 1  # of odometry and of the steps in heading
 THRESHOLDS = (0.15, 0.25, 0.4, 0.6)  # the smallest that leaves survivors is the best
 UNITS = 100.0  # of a residual kept as a byte
 APART_M = 100.0
@@ -32,11 +33,16 @@ KEPT = 10
 
 @dataclass(frozen=True)
 class RatioMap:
-    """Ratios (3, rows, columns) of built ground around the centre of every cell, rows running north."""
+    """Ratios (3, rows, columns) of built ground around a point of every cell, see :meth:`places_m`; rows run
+    north."""
 
     ratios: NDArray[np.float32]
     west_m: float
     south_m: float
+
+    def places_m(self, cells: FloatArray) -> FloatArray:
+        """(H, 2) of cells (H, 2), column and row."""
+        return np.asarray((cells + 0.25) * CELL_M + (self.west_m, self.south_m))
 
 
 @dataclass(frozen=True)
@@ -89,12 +95,15 @@ def ratio_map(
     built = np.zeros((side, side), dtype=np.uint8)
     points, of = shapely.get_coordinates(shapely.get_exterior_ring(outlines), return_index=True)
     pixels = np.round(((points - (west, south)) / RASTER_M - 0.5) * 16.0).astype(np.int32)
-    for ring in np.split(pixels, np.flatnonzero(np.diff(of)) + 1):
-        cv2.fillPoly(built, [ring], 255, cv2.LINE_8, 4)
+    # A filled polygon is half a pixel wider all around: its pixels weigh less, so that its area is right.
+    areas = shapely.area(outlines)
+    weights = 255.0 * areas / (areas + 0.5 * RASTER_M * shapely.length(outlines))
+    rings = np.split(pixels, np.flatnonzero(np.diff(of)) + 1)
+    for ring, weight in zip(rings, weights.tolist(), strict=True):
+        cv2.fillPoly(built, [ring], weight, cv2.LINE_8, 4)
     half = cv2.resize(built, (2 * cells, 2 * cells), interpolation=cv2.INTER_AREA)
     inner, ratios = 0.0, np.empty((3, cells, cells), dtype=np.float32)
     for k, outer in enumerate(radii_m):
-        # Even rows and columns of the half cells: centres lie a quarter of a cell off, within the tolerance.
         kernel = _ring(inner, outer, CELL_M / 2.0)
         ratios[k] = cv2.filter2D(half, cv2.CV_32F, kernel, borderType=cv2.BORDER_CONSTANT)[::2, ::2] / 255.0
         inner = outer
@@ -128,13 +137,15 @@ def search(reference: RatioMap, ratios: FloatArray, path_m: FloatArray) -> Survi
     """
     residuals = [_residual(reference, query) for query in ratios]
     for threshold in THRESHOLDS:
+        level = threshold * UNITS
+        # Every second cell: the tolerance covers those between.
+        start = 2 * np.column_stack(np.nonzero(residuals[0][::2, ::2] <= level))
         found = [
-            _propagate(residuals, path_m, 2.0 * math.pi * h / HEADINGS, threshold) for h in range(HEADINGS)
+            _propagate(residuals, start, path_m, 2.0 * math.pi * h / HEADINGS, level) for h in range(HEADINGS)
         ]
         cells = np.concatenate([places for places, _ in found])
         if len(cells):
-            places = (cells + 0.5) * CELL_M + (reference.west_m, reference.south_m)
-            return Survivors(places, np.concatenate([mean for _, mean in found]))
+            return Survivors(reference.places_m(cells), np.concatenate([mean for _, mean in found]))
     return Survivors(np.empty((0, 2)), np.empty(0))
 
 
@@ -148,20 +159,25 @@ def _residual(reference: RatioMap, query: FloatArray) -> ByteArray:
 
 
 def _propagate(
-    residuals: Sequence[ByteArray], path_m: FloatArray, heading_rad: float, threshold: float
+    residuals: Sequence[ByteArray],
+    start: NDArray[np.int64],
+    path_m: FloatArray,
+    heading_rad: float,
+    level: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Cells (H, 2) column, row of the last keyframe, and mean residuals (H,), at one heading."""
+    """Cells (H, 2) column, row of the last keyframe, and mean residuals (H,), of what starts in cells (S, 2)
+    row, column, at one heading and stays at or below the level."""
     rows, columns = residuals[0].shape
     c, s = math.cos(heading_rad), math.sin(heading_rad)
     moves = np.round((path_m - path_m[0]) @ np.array([[c, s], [-s, c]]) / CELL_M).astype(np.int64)
-    row, column = np.nonzero(residuals[0] <= threshold * UNITS)
+    row, column = start.T
     total = residuals[0][row, column].astype(np.float64)
     for residual, (right, up) in zip(residuals[1:], moves[1:], strict=True):
         at_row, at_column = row + up, column + right
         inside = (at_row >= 0) & (at_row < rows) & (at_column >= 0) & (at_column < columns)
         row, column, total = row[inside], column[inside], total[inside]
         here = residual[row + up, column + right]
-        alive = here <= threshold * UNITS
+        alive = here <= level
         row, column, total = row[alive], column[alive], total[alive] + here[alive]
     last = np.column_stack([column + moves[-1, 0], row + moves[-1, 1]]).astype(np.float64)
     return last, total / (UNITS * len(residuals))

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from buildloc_eval.observation import Digitiser, digitising_offsets
+from buildloc_eval.segmentation_errors import Outlines
 
-Outlines = NDArray[np.object_]
 STRIPS_AT_ONCE = 500
 
 
@@ -64,7 +64,7 @@ def wall_directions(outlines: Outlines) -> FloatArray:
     length = np.where(same, np.hypot(*walls.T), -1.0)
     order = np.lexsort((length, of[:-1]))
     longest = order[np.searchsorted(of[:-1][order], np.arange(len(outlines)), side="right") - 1]
-    return np.arctan2(walls[longest, 1], walls[longest, 0])
+    return np.asarray(np.arctan2(walls[longest, 1], walls[longest, 0]))
 
 
 def reference_outlines(

@@ -5,105 +5,48 @@ Every stage is kept under the output folder, so that a run that is cut off goes 
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import shapely
-from buildloc_mapper.config import MapperConfig
-from buildloc_matcher.config import matcher_config
 from buildloc_matcher.matching import THREADS
 from buildloc_matcher.reference.buildings import Buildings
-from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.footprint import footprints
 
-from buildloc_eval.observation import Digitiser
 from buildloc_eval.paper import brm, methods
-from buildloc_eval.paper.differences import AutomaticMapping, Outlines, redrawn, reference_outlines
+from buildloc_eval.paper.differences import redrawn, reference_outlines
 from buildloc_eval.paper.flights import PaperFlight, flight_config, keyframe_stamps, paper_flights, trajectory
 from buildloc_eval.paper.flown import Maps, Track, limit_threads, map_flight, masks, register, shots
 from buildloc_eval.paper.methods import BRM, STARS, Prediction
-from buildloc_eval.paper.perception import SNOW, PerceptionErrors, perceive
-from buildloc_eval.paper.published import LARGE_RADII_KM, RADII_KM
+from buildloc_eval.paper.plan import (
+    FULL,
+    QUICK,
+    Models,
+    Plan,
+    Stores,
+    maps_name,
+    measured_models,
+    outlines_of,
+    prediction_name,
+    ragged,
+)
+from buildloc_eval.paper.report import write
 from buildloc_eval.paper.sources import read_boston
-from buildloc_eval.paper.store import Store, code_hash
+from buildloc_eval.paper.store import Store
 from buildloc_eval.paper.texture import ground_texture
 from buildloc_eval.realworld import data_folder
+from buildloc_eval.segmentation_errors import Outlines
 
 Say = Callable[[str], None]
 
 FLOWN_OVER_M = 900.0  # around a flight's centre: what any of its frames may see
-PAPER = "buildloc_eval.paper"
-GROUND_CODE = (f"{PAPER}.sources", f"{PAPER}.differences", f"{PAPER}.flights", "buildloc_eval.observation")
-TRACK_CODE = (
-    "buildloc_mapper", "buildloc_msgs_py", "buildloc_eval.flight", "buildloc_eval.camera",
-    "buildloc_eval.places", f"{PAPER}.flights", f"{PAPER}.published", f"{PAPER}.texture", f"{PAPER}.flown",
-)  # fmt: skip
-MAP_CODE = (*TRACK_CODE, *GROUND_CODE, f"{PAPER}.perception", f"{PAPER}.brm")
-PREDICTION_CODE = (
-    *MAP_CODE, "buildloc_matcher", "buildloc_eval.generators", "buildloc_eval.scale", f"{PAPER}.methods"
-)  # fmt: skip
-
-
-class PaperError(BuildlocError):
-    """The experiments cannot be run as asked."""
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What is run: numbers of the paper's flights, seeds of each, radii; of which methods every prefix is
-    located, at which radii and for how many seeds."""
-
-    flights: tuple[int, ...]
-    seeds: int
-    radii_km: tuple[int, ...]
-    prefixes: dict[str, tuple[int, ...]]
-    prefix_seeds: int
-
-
-FULL = Plan(
-    (1, 2, 3, 4, 5, 6, 7), 10, RADII_KM, {"default preset": LARGE_RADII_KM, "paper preset": (6,)}, 1
-)  # fmt: skip
-QUICK = Plan((1, 2), 2, (1, 6, 12), {"default preset": (6,)}, 1)
-
-
-@dataclass(frozen=True)
-class Models:
-    """Every error that is simulated, and the mapper's parameters."""
-
-    digitiser: Digitiser = field(default_factory=Digitiser)
-    automatic: AutomaticMapping = field(default_factory=AutomaticMapping)
-    perception: PerceptionErrors = field(default_factory=PerceptionErrors)
-    snow: PerceptionErrors = SNOW
-    mapper: MapperConfig = field(default_factory=MapperConfig)
-
-
-class Stores:
-    """One folder per stage. Each is refused when an earlier stage's configuration or code has changed."""
-
-    def __init__(self, out: Path, seed: int, models: Models) -> None:
-        said = {name: value for name, value in asdict(models).items() if name != "mapper"}
-        ground = {"seed": seed, "digitiser": said.pop("digitiser"), "automatic": said.pop("automatic")}
-        track = {"seed": seed, "mapper": asdict(models.mapper)}
-        matchers = {name: asdict(matcher_config({"preset": name})) for name in ("default", "paper")}
-        self.ground = Store(out / "ground", _plain(ground | {"code": code_hash(GROUND_CODE)}))
-        self.tracks = Store(out / "tracks", _plain(track | {"code": code_hash(TRACK_CODE)}))
-        maps = ground | track | said
-        self.maps = Store(out / "maps", _plain(maps | {"code": code_hash(MAP_CODE)}))
-        predictions = maps | {"matchers": matchers, "code": code_hash(PREDICTION_CODE)}
-        self.predictions = Store(out / "predictions", _plain(predictions))
-
-
-def _plain(values: dict[str, Any]) -> dict[str, Any]:
-    """As JSON gives it back: lists for tuples."""
-    return dict(json.loads(json.dumps(values)))
 
 
 class Progress:
@@ -124,16 +67,6 @@ class Progress:
         self._say(
             f"{self._stage}: {100.0 * self._done / self._total:.0f} %, {left / 60.0:.1f} min left ({name})"
         )
-
-
-def ragged(outlines: Outlines) -> tuple[Any, ...]:
-    """Outlines as arrays, which are kept and read much faster than objects."""
-    return tuple(shapely.to_ragged_array(outlines))
-
-
-def outlines_of(kept: tuple[Any, ...]) -> Outlines:
-    """Outlines kept by :func:`ragged`."""
-    return np.asarray(shapely.from_ragged_array(*kept))
 
 
 def make_ground(store: Store, flights: Sequence[PaperFlight], models: Models, seed: int, say: Say) -> None:
@@ -164,7 +97,7 @@ def make_track(flight: PaperFlight, models: Models, seed: int) -> Track:
     config = flight_config(flight.like)
     flown = trajectory(flight, seed)
     taken = shots(flown, keyframe_stamps(flight, flown).tolist(), config, seed)
-    ground = ground_texture(data_folder() / "imagery", flight.number, np.random.default_rng([seed, 6]))
+    ground = ground_texture(data_folder(), flight, np.random.default_rng([seed, 6]))
     return register(taken, ground, config, models.mapper, seed)
 
 
@@ -172,12 +105,7 @@ def make_maps(flight: PaperFlight, track: Track, real: tuple[Any, ...], models: 
     """Draw what is flown over and what the segmenter makes of it, and map it."""
     limit_threads()
     true = redrawn(outlines_of(real), models.digitiser, np.random.default_rng([seed, 7, flight.number]))
-    errors = models.snow if flight.like.snow else models.perception
-
-    def perceived(outlines: Outlines, ground: shapely.Polygon, rng: np.random.Generator) -> Any:
-        return perceive(outlines, errors, ground, rng)
-
-    seen = masks(track, true, perceived, 1000 * seed + flight.number)
+    seen = masks(track, true, models.errors(flight), 1000 * seed + flight.number)
     return map_flight(track, seen, models.mapper)
 
 
@@ -186,9 +114,11 @@ def side_by_side(
 ) -> None:
     """Make what is not there yet, of jobs (name, cost, how), on all cores; the costliest first."""
     missing = sorted((job for job in jobs if not store.has(job[0])), key=lambda job: -job[1])
+    if not missing:
+        return
     progress = Progress(say, stage, sum(cost for _, cost, _ in missing))
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(max(1, min(THREADS, len(missing))), context) as pool:
+    with ProcessPoolExecutor(min(THREADS, len(missing)), context) as pool:
         running = {pool.submit(make): (name, cost) for name, cost, make in missing}
         for done in as_completed(running):
             name, cost = running[done]
@@ -213,17 +143,6 @@ def fly_all(
             for s in range(seed, seed + plan.seeds)
         ]
         side_by_side(jobs, stores.maps, f"mapping flight {flight.number}", say)
-
-
-def maps_name(flight: PaperFlight, seed: int) -> str:
-    """Of the maps of a flight and a seed."""
-    return f"flight{flight.number}_seed{seed}"
-
-
-def prediction_name(method: str, radius_km: float, flight: PaperFlight, seed: int, prefixes: bool) -> str:
-    """Of a prediction, or of those of all prefixes."""
-    kind = "prefixes" if prefixes else "whole"
-    return f"{kind}_{method.replace(' ', '_')}_{radius_km:g}km_{maps_name(flight, seed)}"
 
 
 @dataclass(frozen=True)
@@ -315,9 +234,7 @@ def evaluate(out: Path, seed: int, quick: bool, say: Say) -> str:
 
     Raises StaleError when the folder holds results of another configuration or code.
     """
-    from buildloc_eval.paper.report import write
-
-    plan, models, started = QUICK if quick else FULL, Models(), time.perf_counter()
+    plan, models, started = QUICK if quick else FULL, measured_models(), time.perf_counter()
     out.mkdir(parents=True, exist_ok=True)
     flights = [flight for flight in paper_flights() if flight.number in plan.flights]
     stores = Stores(out, seed, models)

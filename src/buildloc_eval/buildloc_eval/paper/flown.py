@@ -19,7 +19,7 @@ from buildloc_mapper.extraction import Extractor
 from buildloc_mapper.fusion import Fusion, View
 from buildloc_mapper.similarity import Similarity
 from buildloc_msgs_py import topics
-from buildloc_msgs_py.ground import camera_matrix, level_to_ray, observe
+from buildloc_msgs_py.ground import camera_matrix, observe
 from buildloc_msgs_py.types import (
     CameraModel,
     FloatArray,
@@ -30,11 +30,11 @@ from buildloc_msgs_py.types import (
     Mask,
 )
 
-from buildloc_eval.camera import attitude, camera_model, level_to_world, photograph
+from buildloc_eval.camera import attitude, camera_model, photograph, world_to_rays
 from buildloc_eval.flight import FlightConfig, Trajectory
 from buildloc_eval.paper.brm import coverage, regions
-from buildloc_eval.paper.perception import Outlines, Perceive
-from buildloc_eval.world import World
+from buildloc_eval.segmentation_errors import Outlines, SegmentationErrors, perceive
+from buildloc_eval.world import Surface
 
 CARRIERS = 12
 
@@ -59,9 +59,9 @@ class Shot:
     def to_pixels(self, camera: CameraModel, origin_m: FloatArray) -> FloatArray:
         """(3, 3) from (x, y, 1), metres east and north of an origin (2,), to true pixels."""
         x, y, height, yaw = self.true_pose
-        placed = level_to_world(x - float(origin_m[0]), y - float(origin_m[1]), yaw)
-        rays = level_to_ray(height, self.true_attitude_xyzw) @ np.linalg.inv(placed)
-        return np.asarray(camera_matrix(camera) @ rays)
+        pose = (x - float(origin_m[0]), y - float(origin_m[1]), height, yaw)
+        rays = world_to_rays(pose, self.true_attitude_xyzw)
+        return np.asarray(camera_matrix(camera) @ rays, dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -116,33 +116,27 @@ def shots(flown: Trajectory, stamps_ns: Sequence[int], config: FlightConfig, see
 
 
 def register(
-    taken: tuple[Shot, ...], world: World, flight: FlightConfig, config: MapperConfig, seed: int
+    taken: tuple[Shot, ...], world: Surface, flight: FlightConfig, config: MapperConfig, seed: int
 ) -> Track:
     """Photograph the ground at every keyframe and let the mapper link them."""
     rng, camera, atlas = np.random.default_rng([seed, 2]), camera_model(flight), Atlas(config)
     poses: list[dict[int, Similarity] | None] = []
-    numbers: list[int] = []  # of the atlas's keyframes: one that shows nothing gets no id there
-    for number, shot in enumerate(taken):
+    for shot in taken:
         image = photograph(world, camera, shot.true_pose, shot.true_attitude_xyzw, flight, rng)
         keyframe = atlas.add(shot.frame(camera, image))
-        if keyframe is None:
-            poses.append(None)
-            continue
-        numbers.append(number)
         linked = atlas.submap(keyframe).poses
-        alone = keyframe > 0 and len(linked) == 1
-        poses.append(None if alone else {numbers[k]: pose for k, pose in linked.items()})
+        poses.append(None if keyframe > 0 and len(linked) == 1 else dict(linked))
     return Track(camera, taken, tuple(poses))
 
 
-def masks(track: Track, outlines: Outlines, perceive: Perceive, seed: int) -> Iterator[Mask]:
-    """The segmenter's mask of every keyframe over outlines (N,) in metres east and north."""
+def masks(track: Track, outlines: Outlines, errors: SegmentationErrors, seed: int) -> Iterator[Mask]:
+    """The mask of every keyframe over outlines (N,) in metres east and north, with a segmenter's errors."""
     places = np.array([shot.true_pose[:2] for shot in track.shots])
     origin = places.mean(axis=0)
     near = shapely.transform(outlines, lambda xy: xy - origin)
     reach = 1.5 * max(shot.altitude_m for shot in track.shots)
     ground = shapely.MultiPoint(places - origin).convex_hull.buffer(reach)
-    seen = perceive(near, ground, np.random.default_rng([seed, 3]))
+    seen = perceive(near, errors, ground, np.random.default_rng([seed, 3]))
     camera, size = track.camera, (track.camera.width, track.camera.height)
     for number, shot in enumerate(track.shots):
         rng = np.random.default_rng([seed, 4, number])

@@ -43,10 +43,12 @@ KEPT = 10  # places
 @dataclass(frozen=True)
 class Prediction:
     """A ranking: the first places (K, 2), where ``centre_m`` of the map lies, or the last camera where that
-    is None; the voting bins (B, 2) in their order, LISTED at most; the refined place of the last camera, or
-    None; why it is no fix, None where it is one; seconds per stage and the funnel."""
+    is None; the yaw and scale (K, 2) of the map there; the voting bins (B, 2) in their order, LISTED at most;
+    the refined place of the last camera, or None; why it is no fix, None where it is one; seconds per stage
+    and the funnel."""
 
     places_m: FloatArray
+    turns: FloatArray
     centre_m: FloatArray | None
     bins: NDArray[np.int32]
     final_m: FloatArray | None
@@ -57,7 +59,8 @@ class Prediction:
 
 def nothing(reason: str) -> Prediction:
     """No place."""
-    return Prediction(np.empty((0, 2)), None, np.empty((0, 2), np.int32), None, reason, {}, {})
+    none = np.empty((0, 2))
+    return Prediction(none, none, None, none.astype(np.int32), None, reason, {}, {})
 
 
 def reference_within(buildings: Buildings, centre_m: FloatArray, radius_km: float) -> ReferenceDatabase:
@@ -94,7 +97,7 @@ def locate(matcher: Matcher, maps: Maps, keyframes: int, final: bool) -> Predict
         return nothing(str(error))
     if found.query is None:
         return nothing("map has fewer than four buildings")
-    places = np.array([[c.x_m, c.y_m] for c in found.candidates[:KEPT]]).reshape(-1, 2)
+    kept = np.array([[c.x_m, c.y_m, c.yaw_rad, c.scale] for c in found.candidates[:KEPT]]).reshape(-1, 4)
     centre, bins = found.query.points_m.mean(axis=0), ranked_bins(found, matcher.config.bin_size_m)
     seconds = dict(found.seconds)
     refined = None
@@ -102,7 +105,9 @@ def locate(matcher: Matcher, maps: Maps, keyframes: int, final: bool) -> Predict
         started = time.perf_counter()
         refined = _refined(matcher, found, maps, snapshot, keyframes)
         seconds["refine"] = time.perf_counter() - started
-    return Prediction(places, centre, bins, refined, matcher.refuse(found), seconds, found.funnel)
+    return Prediction(
+        kept[:, :2], kept[:, 2:], centre, bins, refined, matcher.refuse(found), seconds, found.funnel
+    )  # fmt: skip
 
 
 def _refined(
@@ -133,6 +138,7 @@ def brm_prediction(
     """Hypotheses of the largest radius are independent: those of a smaller one are those inside."""
     places = found.ranked(centre_m, 1000.0 * radius_km)
     return Prediction(
-        places, None, np.empty((0, 2), np.int32), None, None if len(places) else "no hypothesis survives",
+        places, np.full_like(places, np.nan), None, np.empty((0, 2), np.int32), None,
+        "BRM has no measure of acceptance" if len(places) else "no hypothesis survives",
         {"search": seconds}, {"survivors": float(len(found.residuals))},
     )  # fmt: skip

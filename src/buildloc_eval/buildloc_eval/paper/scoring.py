@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -91,7 +90,7 @@ def interval(successes: int, trials: int) -> tuple[float, float]:
 
 
 def recall_row(scores: Sequence[Score]) -> dict[str, Any]:
-    """Recall at 1, 5, 10 with intervals, final success, fixes and false ones, and what lost the failures."""
+    """Recall at 1, 5, 10 with intervals, share with a refined place within 100 m, fixes and false ones."""
     trials = len(scores)
     row: dict[str, Any] = {"trials": trials}
     for k in RANKS:
@@ -101,12 +100,12 @@ def recall_row(scores: Sequence[Score]) -> dict[str, Any]:
     row["final within 100 m"] = len(finals) / trials
     row["fixes"] = sum(s.fix for s in scores) / trials
     row["false fixes"] = sum(s.fix and s.rank != 1 for s in scores)
-    row["lost by"] = dict(Counter(s.lost_by for s in scores if s.lost_by).most_common())
     return row
 
 
 def error_row(scores: Sequence[Score]) -> dict[str, float | None]:
-    """Median and largest coarse and final error, m, of the predictions whose first place is right."""
+    """Median and largest coarse and final error, m, of the predictions whose first place is right, and how
+    many of them have a refined place at all."""
     right = [s for s in scores if s.rank == 1]
     finals = [s.final_m for s in right if math.isfinite(s.final_m)]
     return {
@@ -114,6 +113,7 @@ def error_row(scores: Sequence[Score]) -> dict[str, float | None]:
         "coarse_worst_m": max((s.coarse_m for s in right), default=None),
         "final_median_m": _median(finals),
         "final_worst_m": max(finals, default=None),
+        "refined": len(finals),
     }
 
 

@@ -7,14 +7,13 @@ from pathlib import Path
 import geopandas as gpd
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from pyproj import Transformer
 
 from buildloc_eval.paper.flights import EPSG, MIN_AREA_M2
 from buildloc_eval.realworld import data_folder
+from buildloc_eval.segmentation_errors import Outlines
 
 FOOTPRINTS = "footprints/boston_osm.parquet"
-Outlines = NDArray[np.object_]
 
 
 def read_boston(path: Path | None = None) -> Outlines:

@@ -1,0 +1,409 @@
+"""The report: the paper's tables with its own figures beside ours, the figures, and what the failures failed
+by. Predictions are only read here."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from buildloc_msgs_py.types import FloatArray
+
+from buildloc_eval.html import write_report
+from buildloc_eval.machine import machine
+from buildloc_eval.paper import figures
+from buildloc_eval.paper.flights import PaperFlight
+from buildloc_eval.paper.flown import Maps, true_place
+from buildloc_eval.paper.methods import BRM, PUBLISHED, Prediction
+from buildloc_eval.paper.plan import Models, Plan, Stores, maps_name, outlines_of, prediction_name
+from buildloc_eval.paper.published import (
+    CORRECT_M,
+    FIRST_SUCCESS,
+    LARGE_RADII_KM,
+    RADII_KM,
+    RECALL,
+    SECONDS_PER_QUERY,
+    STABLE_SUCCESS,
+)
+from buildloc_eval.paper.scoring import (
+    RANKS,
+    Score,
+    bins_within,
+    error_row,
+    first_and_stable,
+    recall_row,
+    score,
+)
+from buildloc_eval.segmentation_errors import Outlines
+
+OURS = "default preset"
+METHODS = (BRM, "without shape", "paper preset", OURS)
+REAL = [
+    "real: the footprints (greater Boston, OpenStreetMap 2021) and the ground's texture (orthophotos of "
+    "Barnarp and Banepa, mirrored); registration, mapping, matching and refinement are the system's own",
+    "simulated: the flights, the camera, its telemetry, and the masks (true footprints with the errors of a "
+    "segmenter that are listed below); the reference differs from what is flown over as one digitiser from "
+    "another and by the errors of automatic mapping that are listed below",
+    "the paper's own figures are of seven real flights over Denver with Microsoft's footprints",
+]
+NOT_DONE = ["NetVLAD has not been run: the paper's figures stand alone in its rows"]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A scored whole flight."""
+
+    method: str
+    radius_km: int
+    flight: int
+    seed: int
+    score: Score
+    seconds: dict[str, float]
+
+
+def trials(stores: Stores, flights: Sequence[PaperFlight], plan: Plan, seed: int) -> list[Trial]:
+    """Every whole flight of a plan, scored."""
+    found = []
+    for flight in flights:
+        for s in range(seed, seed + plan.seeds):
+            maps: Maps = stores.maps.load(maps_name(flight, s))
+            for radius in plan.radii_km:
+                for name in METHODS:
+                    prediction = stores.predictions.load(prediction_name(name, radius, flight, s, False))
+                    scored = score(prediction, maps, len(maps.snapshots), radius)
+                    found.append(Trial(name, radius, flight.number, s, scored, dict(prediction.seconds)))
+    return found
+
+
+def recall_table(scored: Sequence[Trial], radii_km: Sequence[int]) -> list[dict[str, Any]]:
+    """The paper's Table "comparison with baselines": share of trials, interval, and the paper's of seven."""
+    rows = []
+    for name in METHODS:
+        for k in RANKS:
+            row: dict[str, Any] = {"method": name, "metric": f"R@{k}"}
+            for radius in radii_km:
+                mine = [t.score for t in scored if (t.method, t.radius_km) == (name, radius)]
+                found = recall_row(mine)
+                low, high = found[f"recall@{k}_95%"]
+                row[f"{radius} km"] = f"{found[f'recall@{k}']:.3f} [{low:.2f}, {high:.2f}] of {len(mine)}"
+                row[f"paper, {radius} km"] = f"{RECALL[PUBLISHED[name]][k][RADII_KM.index(radius)]}/7"
+            rows.append(row)
+    for k in RANKS:
+        cells = {f"paper, {r} km": f"{RECALL['NetVLAD'][k][RADII_KM.index(r)]}/7" for r in radii_km}
+        rows.append({"method": "NetVLAD (not run)", "metric": f"R@{k}", **cells})
+    return rows
+
+
+def flight_table(
+    flights: Sequence[PaperFlight], maps: dict[int, list[Maps]], counts: dict[int, dict[int, int]]
+) -> list[dict[str, Any]]:
+    """The paper's Table "flight trajectories" and the sizes of the references."""
+    rows = []
+    for flight in flights:
+        mine = maps[flight.number]
+        flown = mine[0].true_m
+        lasts = [m.snapshots[-1] for m in mine]
+        sizes = [0 if last is None else len(last.local_map) for last in lasts]
+        row: dict[str, Any] = {
+            "flight": flight.number, "centre (UTM 19N)": "{:.0f}, {:.0f}".format(*flight.centre_m),
+            "environment": flight.like.environment + (", snow" if flight.like.snow else ""),
+            "length_km": round(float(np.hypot(*np.diff(flown, axis=0).T).sum()) / 1000.0, 2),
+            "paper's length": flight.like.length_km, "altitude_m": flight.like.altitude_m,
+            "keyframes": len(flown), "paper's keyframes": flight.like.keyframes,
+            "buildings mapped": float(np.median(sizes)), "paper's": flight.like.detected,
+        }  # fmt: skip
+        for radius, count in counts[flight.number].items():
+            row[f"reference {radius} km"] = count
+            if radius in LARGE_RADII_KM:
+                row[f"paper's {radius} km"] = flight.like.reference[LARGE_RADII_KM.index(radius)]
+        rows.append(row)
+    return rows
+
+
+def error_table(
+    scored: Sequence[Trial], method: str, flights: Sequence[PaperFlight], radii_km: Sequence[int]
+) -> list[dict[str, Any]]:
+    """The paper's Table of coarse and final errors, of a method and the seeds whose first place is right."""
+    rows = []
+    for flight in flights:
+        row: dict[str, Any] = {"flight": flight.number}
+        for radius in (r for r in radii_km if r in LARGE_RADII_KM):
+            mine = [
+                t.score
+                for t in scored
+                if (t.method, t.radius_km, t.flight) == (method, radius, flight.number)
+            ]
+            right = sum(s.rank == 1 for s in mine)
+            column = LARGE_RADII_KM.index(radius)
+            row[f"right, {radius} km"] = f"{right}/{len(mine)}"
+            row |= {f"{key}, {radius} km": value for key, value in error_row(mine).items()}
+            row[f"paper's coarse, {radius} km"] = flight.like.coarse_m[column]
+            row[f"paper's final, {radius} km"] = flight.like.final_m[column]
+        rows.append(row)
+    return rows
+
+
+@dataclass(frozen=True)
+class Converged:
+    """First and stable success of one flight, seed, method and radius, and the trace of the true bin."""
+
+    method: str
+    radius_km: int
+    seed: int
+    flight: int
+    first: int | None
+    stable: int | None
+    ranks: tuple[int, ...]
+    stable_rank: int | None
+
+
+def converged(stores: Stores, flights: Sequence[PaperFlight], plan: Plan, seed: int) -> list[Converged]:
+    """Every prefix of every flight that the plan asks for, scored."""
+    found = []
+    for flight in flights:
+        for s in range(seed, seed + plan.prefix_seeds):
+            maps: Maps = stores.maps.load(maps_name(flight, s))
+            for name, radii in plan.prefixes.items():
+                for radius in radii:
+                    prefixes = stores.predictions.load(prediction_name(name, radius, flight, s, True))
+                    scores = [score(p, maps, n, radius) for n, p in enumerate(prefixes, start=1)]
+                    first, stable = first_and_stable([one.rank == 1 for one in scores])
+                    ranks = tuple(one.bin_rank for one in scores)
+                    _, top = first_and_stable([rank == 1 for rank in ranks])
+                    found.append(Converged(name, radius, s, flight.number, first, stable, ranks, top))
+    return found
+
+
+def convergence_table(all_of: Sequence[Converged]) -> list[dict[str, Any]]:
+    """Mean keyframes to the first and the stable success, over the flights that have one, and the paper's."""
+    rows = []
+    for name, radius in dict.fromkeys((c.method, c.radius_km) for c in all_of):
+        mine = [c for c in all_of if (c.method, c.radius_km) == (name, radius)]
+        first, stable = ([getattr(c, kind) for c in mine] for kind in ("first", "stable"))
+        column = LARGE_RADII_KM.index(radius) if radius in LARGE_RADII_KM else None
+        row: dict[str, Any] = {"method": name, "radius_km": radius, "flights": len(mine)}
+        for kind, values, published in (
+            ("first success", first, FIRST_SUCCESS), ("stable success", stable, STABLE_SUCCESS)
+        ):  # fmt: skip
+            reached = [v for v in values if v is not None]
+            row[kind] = float(np.mean(reached)) if reached else None
+            row[f"{kind}, flights"] = len(reached)
+            row[f"{kind}, paper's"] = None if column is None else published[column]
+        row["by flight, first"] = ", ".join(f"{c.flight}: {c.first}" for c in mine)
+        row["by flight, stable"] = ", ".join(f"{c.flight}: {c.stable}" for c in mine)
+        rows.append(row)
+    return rows
+
+
+def acceptance_table(scored: Sequence[Trial], radii_km: Sequence[int]) -> list[dict[str, Any]]:
+    """Shares of trials whose refined place is right, and which are a fix; and the fixes that are wrong."""
+    rows = []
+    for name in (n for n in METHODS if n != BRM):
+        for radius in radii_km:
+            found = recall_row([t.score for t in scored if (t.method, t.radius_km) == (name, radius)])
+            kept = {key: found[key] for key in ("trials", "final within 100 m", "fixes", "false fixes")}
+            rows.append({"method": name, "radius_km": radius, **kept})
+    return rows
+
+
+def runtime_table(scored: Sequence[Trial], radii_km: Sequence[int]) -> list[dict[str, Any]]:
+    """Median milliseconds per stage of a query with a whole flight's map."""
+    rows = []
+    for name in METHODS:
+        for radius in radii_km:
+            mine = [t.seconds for t in scored if (t.method, t.radius_km) == (name, radius) and t.seconds]
+            stages = dict.fromkeys(stage for seconds in mine for stage in seconds)
+            row: dict[str, Any] = {"method": name, "radius_km": radius}
+            row["total_ms"] = 1e3 * float(np.median([sum(s.values()) for s in mine])) if mine else None
+            row |= {f"{g}_ms": 1e3 * float(np.median([s.get(g, 0.0) for s in mine])) for g in stages}
+            if radius in LARGE_RADII_KM:
+                low, high = SECONDS_PER_QUERY[LARGE_RADII_KM.index(radius)]
+                row["paper's (GPU, segmentation too)"] = f"{1e3 * low:.0f} to {1e3 * high:.0f}"
+            rows.append(row)
+    return rows
+
+
+def failure_table(scored: Sequence[Trial]) -> list[dict[str, Any]]:
+    """What lost the trials whose first place is wrong, and which they were."""
+    rows = []
+    for name in METHODS:
+        lost = [t for t in scored if t.method == name and t.score.lost_by]
+        for reason, count in Counter(t.score.lost_by for t in lost).most_common():
+            mine = [t for t in lost if t.score.lost_by == reason]
+            where = Counter(f"flight {t.flight} at {t.radius_km} km" for t in mine)
+            places = ", ".join(f"{place}: {n}" for place, n in where.most_common())
+            rows.append({"method": name, "lost by": reason, "trials": count, "where": places})
+    return rows
+
+
+def bars(
+    scored: Sequence[Trial], traces: Sequence[Converged], seconds: float, quick: bool
+) -> list[dict[str, Any]]:
+    """The issue's bars that this run can answer."""
+
+    def recall(method: str, radii: Sequence[int]) -> float | None:
+        mine = [t.score.rank == 1 for t in scored if t.method == method and t.radius_km in radii]
+        return float(np.mean(mine)) if mine else None
+
+    large = [t.score for t in scored if t.method == OURS and t.radius_km in LARGE_RADII_KM]
+    finals = [s.final_m for s in large if s.rank == 1 and math.isfinite(s.final_m)]
+    stable = [c.stable for c in traces if c.method == OURS and c.radius_km == 6]
+    reached = [s for s in stable if s is not None]
+    mean = float(np.mean(reached)) if reached and len(reached) == len(stable) else None
+    rows = [
+        ("default preset, recall@1 at 6 and 9 km", 1.0, recall(OURS, (6, 9)), True),
+        ("default preset, recall@1 at 12 km", 0.97, recall(OURS, (12,)), True),
+        ("paper preset, recall@1 at 12 km (paper: 5/7)", None, recall("paper preset", (12,)), True),
+        ("keyframes to stable success at 6 km, mean over all flights", 30.0, mean, False),
+        ("final error, median, m", 10.0, float(np.median(finals)) if finals else None, False),
+        ("final error, worst, m", 30.0, max(finals) if finals else None, False),
+        ("minutes of this run, of what was not there yet", 5.0 if quick else 60.0, seconds / 60.0, False),
+    ]
+    return [
+        {
+            "what": what, "bar": bar, "measured": value,
+            "held": None if bar is None else value is not None and (value >= bar if more else value <= bar),
+        }
+        for what, bar, value, more in rows
+    ]  # fmt: skip
+
+
+def write(
+    out: Path, stores: Stores, flights: Sequence[PaperFlight], plan: Plan, models: Models, seed: int,
+    quick: bool, seconds: float,
+) -> str:  # fmt: skip
+    """Score all predictions, write report.json and report.html; the summary."""
+    kept, buildings = stores.ground.load("reference")
+    reference = outlines_of(kept)
+    scored, traces = trials(stores, flights, plan, seed), converged(stores, flights, plan, seed)
+    maps = {
+        f.number: [stores.maps.load(maps_name(f, s)) for s in range(seed, seed + plan.seeds)] for f in flights
+    }
+    counts = {
+        f.number: {
+            radius: int((np.hypot(*(buildings.centroids_m - f.centre_m).T) <= 1000.0 * radius).sum())
+            for radius in plan.radii_km
+        }
+        for f in flights
+    }
+    report = {
+        "evaluation": "paper",
+        "what is real": REAL,
+        "not done": NOT_DONE,
+        "command": " ".join(["buildloc", *sys.argv[1:]]),
+        "seed": seed,
+        "quick": quick,
+        **machine(),
+        "bars": bars(scored, traces, seconds, quick),
+        "flights and references": flight_table(flights, maps, counts),
+        "recall": recall_table(scored, plan.radii_km),
+        "errors, default preset": error_table(scored, OURS, flights, plan.radii_km),
+        "errors, paper preset": error_table(scored, "paper preset", flights, plan.radii_km),
+        "refined places and fixes": acceptance_table(scored, plan.radii_km),
+        "convergence": convergence_table(traces),
+        "time of a query": runtime_table(scored, plan.radii_km),
+        "failures": failure_table(scored),
+        "error models": asdict(models),
+        "plan": asdict(plan),
+    }
+    (out / "report.json").write_text(json.dumps(report, indent=2) + "\n")
+    pictures = draw(out, stores, flights, plan, seed, reference, scored, traces)
+    write_report(out / "report.html", "The paper's experiments on open data", report, pictures)
+    return summary(report)
+
+
+def draw(
+    out: Path, stores: Stores, flights: Sequence[PaperFlight], plan: Plan, seed: int, reference: Outlines,
+    scored: Sequence[Trial], traces: Sequence[Converged],
+) -> list[tuple[str, Path]]:  # fmt: skip
+    """All figures with their captions."""
+    centres = shapely.get_coordinates(shapely.centroid(reference))
+    around = {f.number: reference[np.hypot(*(centres - f.centre_m).T) < 1500.0] for f in flights}
+    first = {f.number: stores.maps.load(maps_name(f, seed)) for f in flights}
+    paths = {number: maps.true_m for number, maps in first.items()}
+    pictures = [
+        (
+            "Flights over the reference (simulated flights, real footprints)",
+            figures.draw_trajectories(out / "trajectories.png", around, paths),
+        )
+    ]
+    for name, radius in dict.fromkeys((c.method, c.radius_km) for c in traces):
+        mine = [
+            figures.Trace(c.flight, c.ranks, c.stable_rank)
+            for c in traces
+            if (c.method, c.radius_km, c.seed) == (name, radius, seed)
+        ]
+        path = out / f"convergence_{name.replace(' ', '_')}_{radius}km.png"
+        figures.draw_convergence(path, mine, radius, bins_within(radius))
+        pictures.append((f"Rank of the true bin as keyframes accumulate: {name}, {radius} km", path))
+    rows = {name: radius_row(scored, name, plan.radii_km) for name in METHODS}
+    drawn = figures.draw_radius(out / "radius.png", plan.radii_km, rows)
+    pictures.append(("Recall, coarse error and time against the search radius", drawn))
+    shown = flights[-1]
+    radius = 6 if 6 in plan.radii_km else plan.radii_km[-1]
+    found: dict[str, Prediction] = {
+        name: stores.predictions.load(prediction_name(name, radius, shown, seed, False)) for name in METHODS
+    }
+    maps, wide = first[shown.number], 1000.0 * radius + figures.VIEW_M
+    last = maps.snapshots[-1]
+    map_m = np.empty((0, 2)) if last is None else last.local_map.centroids_m
+    within = reference[np.hypot(*(centres - shown.centre_m).T) < wide]
+    truths = {name: _truth(maps, prediction) for name, prediction in found.items()}
+    path = figures.draw_candidates(out / "candidates.png", within, found, map_m, truths, CORRECT_M)
+    pictures.append((f"The first three places of every method: flight {shown.number}, {radius} km", path))
+    return pictures
+
+
+def _truth(maps: Maps, prediction: Prediction) -> FloatArray:
+    last = maps.snapshots[-1]
+    if prediction.centre_m is None or last is None:
+        return np.asarray(maps.true_m[-1])
+    return true_place(maps, last, prediction.centre_m)
+
+
+def radius_row(
+    scored: Sequence[Trial], method: str, radii_km: Sequence[int]
+) -> dict[str, list[float | None]]:
+    """What the figure shows of a method."""
+    row: dict[str, list[float | None]] = {"recall@1": [], "coarse error, m": [], "seconds per query": []}
+    for radius in radii_km:
+        mine = [t for t in scored if (t.method, t.radius_km) == (method, radius)]
+        times = [sum(t.seconds.values()) for t in mine if t.seconds]
+        row["recall@1"].append(sum(t.score.rank == 1 for t in mine) / len(mine))
+        row["coarse error, m"].append(error_row([t.score for t in mine])["coarse_median_m"])
+        row["seconds per query"].append(float(np.median(times)) if times else None)
+    return row
+
+
+def summary(report: dict[str, Any]) -> str:
+    """For people."""
+    lines = [*report["what is real"], *report["not done"], ""]
+    lines += [
+        f"{row['what']}: {_figure(row['measured'])}"
+        + (
+            ""
+            if row["bar"] is None
+            else f" (bar {_figure(row['bar'])}: {'held' if row['held'] else 'missed'})"
+        )
+        for row in report["bars"]
+    ]
+    lines += ["", "recall@1, ours (the paper's)"]
+    for row in report["recall"]:
+        if row["metric"] == "R@1":
+            cells = [
+                f"{radius} km {row.get(f'{radius} km', '-').split(' ')[0]} ({row[f'paper, {radius} km']})"
+                for radius in report["plan"]["radii_km"]
+            ]
+            lines.append(f"{row['method']:<18} " + "  ".join(cells))
+    return "\n".join(lines)
+
+
+def _figure(value: float | None) -> str:
+    return "none" if value is None else f"{value:.3g}"

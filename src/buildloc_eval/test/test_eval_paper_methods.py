@@ -1,0 +1,289 @@
+"""The paper's protocol: baselines on cases where they must succeed, scores, kept results, the report."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from buildloc_eval.paper import brm, methods
+from buildloc_eval.paper.evaluate import predict_all
+from buildloc_eval.paper.flights import EPSG, PaperFlight
+from buildloc_eval.paper.flown import Maps, Snapshot
+from buildloc_eval.paper.methods import BRM, STARS, Prediction
+from buildloc_eval.paper.plan import Models, Plan, Stores, maps_name, ragged
+from buildloc_eval.paper.published import FLIGHTS
+from buildloc_eval.paper.report import write
+from buildloc_eval.paper.scoring import (
+    Score,
+    bins_within,
+    error_row,
+    first_and_stable,
+    interval,
+    lost_by,
+    rank_of_bin,
+    recall_row,
+    score,
+)
+from buildloc_eval.paper.store import StaleError, Store, code_hash
+from buildloc_eval.segmentation_errors import SegmentationErrors
+from buildloc_matcher.reference.buildings import Buildings
+from buildloc_msgs_py.footprint import footprints
+from buildloc_msgs_py.types import CameraModel, FrameObservation, Keyframe, LocalMap
+from numpy.testing import assert_allclose
+
+CENTRE = np.array([320_000.0, 4_690_000.0])
+CAMERA = CameraModel(320, 240, 300.0, 300.0, 159.5, 119.5)
+ERRORS = SegmentationErrors(
+    1, 0.1, 0.05, 0.05, 100.0, 0.2, 30.0, 0.5, 0.0, 0.2, (0.05, 0.05, 0.05, 0.05), 0.6, 1, 0.1, 0.2, 0.5
+)
+DOWN = (0.0, 0.0, 0.0, 1.0)
+
+
+def town(count: int = 3000, half_m: float = 1000.0, seed: int = 1) -> np.ndarray:
+    """Houses of many sizes and headings at places drawn apart from each other."""
+    rng = np.random.default_rng(seed)
+    side = math.ceil(math.sqrt(count))
+    grid = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=2).reshape(-1, 2)[:count]
+    places = (grid / side - 0.5) * 2.0 * half_m + rng.uniform(-9.0, 9.0, (count, 2))
+    size = rng.uniform(7.0, 22.0, (count, 2)) @ np.diag([1.0, 0.6])
+    box = np.array([-0.5 - 0.5j, 0.5 - 0.5j, 0.5 + 0.5j, -0.5 + 0.5j])
+    corners = box.real * size[:, :1] + 1j * box.imag * size[:, 1:]
+    corners = corners * np.exp(1j * rng.uniform(0, math.pi, count))[:, None] + (places @ (1.0, 1.0j))[:, None]
+    outlines = shapely.polygons(np.stack([corners.real, corners.imag], axis=2) + CENTRE)
+    return np.asarray(outlines)
+
+
+def measured(outlines: np.ndarray) -> Buildings:
+    found = footprints(outlines)
+    return Buildings(found.centroids_m, found.areas_m2.astype(np.float32), found.shapes.astype(np.float32))
+
+
+def flown_maps(outlines: np.ndarray, keyframes: int = 12, heading_rad: float = 0.7) -> Maps:
+    """Faultless maps of a straight flight to the east through CENTRE, turned by a heading."""
+    true = CENTRE + np.column_stack([np.linspace(-180.0, 180.0, keyframes), np.zeros(keyframes)])
+    found = footprints(outlines)
+    c, s = math.cos(heading_rad), math.sin(heading_rad)
+    to_map = np.array([[c, -s], [s, c]])  # world -> map: turned by the heading
+    poses = (true - CENTRE) @ to_map.T
+    snapshots, observations, ratios = [], [], []
+    radii = brm.regions(CAMERA, 100.0)
+    tree = shapely.STRtree(outlines)
+    for n in range(1, keyframes + 1):
+        apart = np.hypot(*(found.centroids_m[:, None] - true[None, :n]).transpose(2, 0, 1)).min(axis=1)
+        rows = np.flatnonzero(apart < 70.0)
+        local_map = LocalMap.whole(
+            n, rows.astype(np.int64), (found.centroids_m[rows] - CENTRE) @ to_map.T, found.areas_m2[rows],
+            found.shapes[rows], np.full(len(rows), 3, dtype=np.int64),
+        )  # fmt: skip
+        frames = tuple(Keyframe(i + 1, *poses[i].tolist(), heading_rad) for i in range(n))
+        snapshots.append(Snapshot(local_map, frames, tuple(range(n))))
+        near = rows[np.hypot(*(found.centroids_m[rows] - true[n - 1]).T) < 40.0]
+        observations.append(FrameObservation(n, found.centroids_m[near] - true[n - 1], 100.0))
+        ratios.append(
+            [_built(outlines, tree, true[n - 1], a, b) for a, b in zip((0.0, *radii[:2]), radii, strict=True)]
+        )
+    # Image-right is east: the keyframe's yaw in the map is the map's own turn.
+    return Maps(tuple(snapshots), tuple(observations), radii, np.array(ratios), true, np.zeros(keyframes))
+
+
+def _built(outlines: np.ndarray, tree: shapely.STRtree, at: np.ndarray, inner: float, outer: float) -> float:
+    ring = shapely.Point(*at).buffer(outer, 64).difference(shapely.Point(*at).buffer(inner, 64))
+    return float(shapely.area(shapely.intersection(outlines[tree.query(ring)], ring)).sum() / ring.area)
+
+
+@pytest.fixture(scope="module")
+def outlines() -> np.ndarray:
+    return town()
+
+
+@pytest.fixture(scope="module")
+def maps(outlines: np.ndarray) -> Maps:
+    return flown_maps(outlines)
+
+
+def test_the_ratios_of_a_mask_are_those_of_its_rings() -> None:
+    mask = np.zeros((240, 320), dtype=np.uint8)
+    y, x = np.mgrid[:240, :320]
+    radii = brm.regions(CAMERA, 100.0)  # at 1/3 m per pixel: 12.7, 25.3 and 38 m
+    assert_allclose(radii, np.array([1, 2, 3]) * 0.95 * 40.0 / 3.0)
+    mask[np.hypot(x - 159.5, y - 119.5) < radii[0] * 3.0] = 255
+    assert_allclose(brm.coverage(mask, CAMERA, 100.0, DOWN, radii), [1.0, 0.0, 0.0], atol=0.02)
+    mask[:, :160] = 255
+    assert_allclose(brm.coverage(mask, CAMERA, 100.0, DOWN, radii), [1.0, 0.5, 0.5], atol=0.03)
+
+
+def test_the_ratio_map_holds_the_built_share_of_the_rings(outlines: np.ndarray) -> None:
+    radii = brm.regions(CAMERA, 100.0)
+    reference = brm.ratio_map(outlines, CENTRE, 300.0, radii)
+    tree = shapely.STRtree(outlines)
+    rows = columns = np.array([5, 20, 44])
+    for row, column in zip(rows, columns, strict=True):
+        (at,) = reference.places_m(np.array([[column, row]], dtype=np.float64))
+        truth = [_built(outlines, tree, at, a, b) for a, b in zip((0.0, *radii[:2]), radii, strict=True)]
+        # The raster of 2.5 m: the inner region of 500 m2 feels it most.
+        assert_allclose(reference.ratios[:, row, column], truth, atol=0.04)
+
+
+def test_brm_finds_a_flight_of_unknown_heading(outlines: np.ndarray) -> None:
+    # Half of the houses: BRM lives on ground that is built here more and there less.
+    some = outlines[np.random.default_rng(4).random(len(outlines)) < 0.5]
+    maps = flown_maps(some)
+    reference = brm.ratio_map(some, CENTRE, 700.0, maps.radii_m)
+    found, _ = methods.brm_survivors(reference, maps)
+    prediction = methods.brm_prediction(found, 0.1, CENTRE, 0.7)
+    result = score(prediction, maps, len(maps.true_m), 0.7)
+    assert result.rank == 1 and result.coarse_m < 40.0
+    assert not result.fix
+    # Within a smaller circle are those of its hypotheses that lie inside.
+    inside = found.ranked(maps.true_m[-1], 60.0)
+    assert len(inside) and np.hypot(*(inside - maps.true_m[-1]).T).max() <= 60.0
+
+
+def test_brm_with_impossible_ratios_has_no_survivor(outlines: np.ndarray, maps: Maps) -> None:
+    reference = brm.ratio_map(outlines, CENTRE, 300.0, maps.radii_m)
+    found = brm.search(reference, np.ones((3, 3)), np.array([[0.0, 0.0], [60.0, 0.0], [120.0, 0.0]]))
+    assert len(found.residuals) == 0 and found.ranked(CENTRE, 300.0).shape == (0, 2)
+    refused = methods.brm_prediction(found, 0.0, CENTRE, 0.3).refused
+    assert refused == "no hypothesis survives"
+
+
+def test_keyframes_used_by_brm_are_a_step_apart_and_end_with_the_last() -> None:
+    path = np.column_stack([np.arange(0.0, 131.0, 10.0), np.zeros(14)])
+    assert brm.used_keyframes(path) == [0, 5, 10, 13]
+
+
+@pytest.mark.parametrize("name", STARS)
+def test_every_star_method_finds_a_faultless_map(name: str, outlines: np.ndarray, maps: Maps) -> None:
+    database = methods.reference_within(measured(outlines), CENTRE, 0.8)
+    assert database.epsg == EPSG and len(database) < len(outlines)
+    found = methods.locate(methods.make_matcher(name, database), maps, len(maps.true_m), final=True)
+    result = score(found, maps, len(maps.true_m), 0.8)
+    assert (result.rank, result.bin_rank, result.lost_by) == (1, 1, "")
+    assert result.coarse_m < 5.0 and result.final_m < 2.0
+    assert set(found.seconds) >= {"match", "vote", "select", "refine"}
+
+
+def test_a_keyframe_that_links_to_nothing_is_a_failure_with_its_reason(maps: Maps) -> None:
+    @dataclass(frozen=True)
+    class Never:
+        """A matcher that is not asked."""
+
+    alone = Maps((None,), maps.observations[:1], maps.radii_m, maps.ratios[:1], maps.true_m[:1], np.zeros(1))
+    found = methods.locate(Never(), alone, 1, final=True)  # type: ignore[arg-type]
+    result = score(found, alone, 1, 1.0)
+    assert result == Score(0, math.inf, math.inf, bins_within(1.0), False, str(found.refused))
+    assert "links to none" in result.lost_by
+
+
+def prediction(places: list[list[float]], bins: list[list[int]]) -> Prediction:
+    at = np.array(places, dtype=np.float64).reshape(-1, 2)
+    ranked = np.array(bins, dtype=np.int32).reshape(-1, 2)
+    return Prediction(at, np.zeros_like(at), np.zeros(2), ranked, None, None, {}, {})
+
+
+def test_the_rank_of_the_true_bin_counts_its_neighbours() -> None:
+    found = prediction([[0.0, 0.0]], [[0, 0], [5, 5], [6, 7], [7, 7]])
+    assert rank_of_bin(found, np.array([700.0, 710.0]), 6.0) == 3
+    assert rank_of_bin(found, np.array([20.0, -30.0]), 6.0) == 1
+    # A bin without votes ties for the last of 11,310, as the paper counts them at 6 km.
+    assert rank_of_bin(found, np.array([5000.0, 0.0]), 6.0) == 11_310
+
+
+def test_each_failure_names_the_stage_that_lost_it() -> None:
+    found = prediction([[0.0, 0.0]], [[0, 0], [9, 9]])
+    assert lost_by(found, 2, 1, 6.0).startswith("ranking")
+    assert lost_by(found, 0, 2, 6.0).startswith("selection")
+    assert lost_by(found, 0, bins_within(6.0), 6.0).startswith("matching")
+    assert lost_by(methods.nothing("too few"), 0, bins_within(6.0), 6.0) == "too few"
+
+
+@pytest.mark.parametrize(
+    ("right", "first", "stable"),
+    [
+        ([False, True, False, True, True], 2, 4),
+        ([True, True], 1, 1),
+        ([True, False], 1, None),
+        ([False, False], None, None),
+    ],
+)
+def test_first_and_stable_success(right: list[bool], first: int | None, stable: int | None) -> None:
+    assert first_and_stable(right) == (first, stable)
+
+
+def test_recall_has_an_interval_and_errors_are_of_the_right_ones() -> None:
+    scores = [Score(1, 10.0 + n, 4.0, 1, True, "") for n in range(7)]
+    assert interval(7, 7) == (0.6457, 1.0)  # "7 of 7" is no certainty
+    scores += [
+        Score(3, 900.0, math.inf, 3, True, "ranking"),
+        Score(0, math.inf, math.inf, 9, False, "matching"),
+    ]
+    row = recall_row(scores)
+    assert (row["recall@1"], row["recall@5"], row["recall@10"]) == (7 / 9, 8 / 9, 8 / 9)
+    assert (row["fixes"], row["false fixes"], row["final within 100 m"]) == (8 / 9, 1, 7 / 9)
+    assert error_row(scores) == {
+        "coarse_median_m": 13.0, "coarse_worst_m": 16.0, "final_median_m": 4.0, "final_worst_m": 4.0,
+        "refined": 7,
+    }  # fmt: skip
+    assert error_row(scores[-1:])["final_median_m"] is None
+
+
+def test_kept_results_are_made_once(tmp_path: Path) -> None:
+    store, made = Store(tmp_path / "stage", {"seed": 1}), []
+    for _ in range(2):
+        assert store.get("one", lambda: made.append(1) or 5) == 5
+    assert made == [1]
+    assert Store(tmp_path / "stage", {"seed": 1}).load("one") == 5
+    assert not list((tmp_path / "stage").glob("*.part"))
+
+
+def test_results_of_another_configuration_or_code_are_refused(tmp_path: Path) -> None:
+    Store(tmp_path / "stage", {"seed": 1, "code": "a"})
+    with pytest.raises(StaleError, match="another code"):
+        Store(tmp_path / "stage", {"seed": 1, "code": "b"})
+    models, out = Models(ERRORS), tmp_path / "run"
+    Stores(out, 1, models)
+    with pytest.raises(StaleError, match="another seed"):
+        Stores(out, 2, models)
+
+
+def test_the_code_hash_follows_the_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "some_code.py").write_text("A = 1\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    before = code_hash(["some_code"])
+    assert before == code_hash(["some_code"])
+    (tmp_path / "some_code.py").write_text("A = 2\n")
+    assert code_hash(["some_code"]) != before
+
+
+def test_a_run_is_predicted_scored_and_reported_and_goes_on_where_it_was(
+    tmp_path: Path, outlines: np.ndarray, maps: Maps
+) -> None:
+    flight = PaperFlight(FLIGHTS[0], (float(CENTRE[0]), float(CENTRE[1])))
+    plan, models, said = Plan((1,), 1, (1,), {"default preset": (1,)}, 1), Models(ERRORS), list[str]()
+    stores = Stores(tmp_path, 1, models)
+    stores.ground.save("reference", (ragged(outlines), measured(outlines)))
+    stores.maps.save(maps_name(flight, 1), maps)
+    predict_all(stores, [flight], plan, 1, said.append)
+    made = {path: path.stat().st_mtime_ns for path in stores.predictions.folder.glob("*.pickle")}
+    assert len(made) == len(STARS) + 2  # BRM, and the prefixes
+    assert any("min left" in line for line in said)
+    predict_all(stores, [flight], plan, 1, said.append)
+    assert made == {path: path.stat().st_mtime_ns for path in made}
+    text = write(tmp_path, stores, [flight], plan, models, 1, True, 12.0)
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert list(report)[:3] == ["evaluation", "what is real", "not done"]
+    recall = {(row["method"], row["metric"]): row for row in report["recall"]}
+    assert recall["default preset", "R@1"]["1 km"].startswith("1.000 [0.21, 1.00]")
+    assert recall["paper preset", "R@1"]["paper, 1 km"] == "7/7"
+    assert recall["NetVLAD (not run)", "R@1"]["paper, 1 km"] == "5/7"
+    (trace,) = report["convergence"]
+    assert trace["first success"] <= trace["stable success"] <= len(maps.true_m)
+    html = (tmp_path / "report.html").read_text()
+    assert html.count("<img") == 4 and 'src="http' not in html
+    assert html.index("simulated:") < html.index("recall")
+    assert "NetVLAD has not been run" in text and BRM in text
