@@ -63,7 +63,7 @@ def test_decoys_leave_every_roof_untouched() -> None:
 def test_weather_and_camera_keep_shape_type_and_range() -> None:
     rgb, labels = render(64, 0.2, np.random.default_rng(1))
     for seed in range(30):
-        out = augmented(rgb, labels, 0.2, np.random.default_rng(seed))
+        out = augmented(rgb, labels, 0.2, 1.0, np.random.default_rng(seed))
         assert out.shape == rgb.shape and out.dtype == np.float32
         assert np.isfinite(out).all() and out.min() >= 0.0 and out.max() <= 255.0
 
@@ -72,7 +72,9 @@ def test_snow_brightens_and_colours_change_with_the_seed() -> None:
     rgb = np.full((64, 64, 3), 80.0, dtype=np.float32)
     labels = np.zeros((64, 64), dtype=np.int32)
     assert max(snow(rgb, labels, np.random.default_rng(seed)).mean() for seed in range(5)) > 120.0
-    assert not np.allclose(colours(rgb, np.random.default_rng(0)), colours(rgb, np.random.default_rng(1)))
+    assert not np.allclose(
+        colours(rgb, 1.0, np.random.default_rng(0)), colours(rgb, 1.0, np.random.default_rng(1))
+    )
 
 
 def test_a_coarser_picture_loses_detail_and_keeps_its_mean() -> None:
@@ -96,7 +98,7 @@ def white_roofs(gsd_m: float) -> Scene:
 
 
 def test_labels_follow_the_picture_at_any_scale_heading_and_tilt(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("crops.augmented", lambda rgb, labels, gsd_m, rng: rgb)
+    monkeypatch.setattr("crops.augmented", lambda rgb, labels, gsd_m, strength, rng: rgb)
     for gsd in (0.1, 0.2, 0.3):
         rgb, target, weight = CropSampler([white_roofs(gsd)], PLAIN, seed=1).batch(0, 6)
         known = weight[:, 0] > 0

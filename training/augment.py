@@ -10,22 +10,24 @@ from rendered import Image, Labels, noise
 COARSEST_GSD_M = 0.5
 
 
-def colours(rgb: Image, rng: np.random.Generator) -> Image:
-    """Light and camera: white balance, saturation, hue, gamma, contrast, brightness, haze."""
+def colours(rgb: Image, strength: float, rng: np.random.Generator) -> Image:
+    """Light and camera: hue, saturation, white balance, gamma, contrast, brightness; ``strength`` of 1 goes
+    as far as cameras and suns do."""
     out = rgb
-    if rng.random() < 0.5:  # turn the hues: roofs and grounds come in every colour
+    if rng.random() < 0.5 * strength:  # turn the hues: roofs and grounds come in every colour
         hsv = cv2.cvtColor(np.clip(out, 0, 255).astype(np.uint8), cv2.COLOR_RGB2HSV).astype(np.int16)
         hsv[..., 0] = (hsv[..., 0] + rng.integers(-18, 19)) % 180
         out = cv2.cvtColor(hsv.astype(np.uint8), cv2.COLOR_HSV2RGB).astype(np.float32)
     grey = out.mean(axis=2, keepdims=True)
-    out = grey + (out - grey) * np.float32(
-        rng.uniform(0.0, 0.5) if rng.random() < 0.2 else rng.uniform(0.5, 1.5)
-    )
-    out = out * rng.uniform(0.8, 1.2, 3).astype(np.float32)
-    out = 255.0 * np.power(np.clip(out / 255.0, 0.0, 1.0), np.float32(np.exp(rng.uniform(-0.45, 0.45))))
+    faded = rng.random() < 0.2 * strength
+    saturation = rng.uniform(0.0, 0.5) if faded else 1.0 + strength * rng.uniform(-0.5, 0.5)
+    out = grey + (out - grey) * np.float32(saturation)
+    out = out * (1.0 + strength * rng.uniform(-0.2, 0.2, 3)).astype(np.float32)
+    gamma = np.float32(np.exp(strength * rng.uniform(-0.45, 0.45)))
+    out = 255.0 * np.power(np.clip(out / 255.0, 0.0, 1.0), gamma)
     mean = out.mean()
-    out = (out - mean) * np.float32(rng.uniform(0.55, 1.4)) + mean + np.float32(rng.uniform(-35.0, 35.0))
-    return np.clip(out, 0.0, 255.0)
+    contrast, shift = 1.0 + strength * rng.uniform(-0.45, 0.4), strength * rng.uniform(-35.0, 35.0)
+    return np.clip((out - mean) * np.float32(contrast) + mean + np.float32(shift), 0.0, 255.0)
 
 
 def snow(rgb: Image, labels: Labels, rng: np.random.Generator) -> Image:
@@ -87,18 +89,18 @@ def sensor(rgb: Image, rng: np.random.Generator) -> Image:
     return np.clip(out, 0.0, 255.0).astype(np.float32)
 
 
-def augmented(rgb: Image, labels: Labels, gsd_m: float, rng: np.random.Generator) -> Image:
-    """A picture as another flight would have taken it; the labels stay true."""
+def augmented(rgb: Image, labels: Labels, gsd_m: float, strength: float, rng: np.random.Generator) -> Image:
+    """A picture as another flight would have taken it; the labels stay true. ``strength`` from 0 to 1."""
     out: Image = rgb
-    if rng.random() < 0.3:
+    if rng.random() < 0.3 * strength:
         out = season(out, rng)
-    if rng.random() < 0.08:
+    if rng.random() < 0.08 * strength:
         out = snow(out, labels, rng)
-    if rng.random() < 0.15:
+    if rng.random() < 0.15 * strength:
         out = cloud_shadow(out, rng)
-    out = colours(out, rng)
-    if rng.random() < 0.35:
+    out = colours(out, strength, rng)
+    if rng.random() < 0.35 * strength:
         out = coarse(out, gsd_m, rng)
-    if rng.random() < 0.25:
+    if rng.random() < 0.25 * strength:
         out = blur(out, rng)
     return sensor(out, rng)

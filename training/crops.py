@@ -23,13 +23,16 @@ RENDERED_SIDE_PX = 448
 @dataclass(frozen=True)
 class CropConfig:
     """How crops are drawn: shares of rendered scenes and of real crops with decoys, scale range of a wrong
-    altitude, tilt."""
+    altitude, tilt; and the last part of a run, whose crops are closer to what a camera brings: rendered
+    scenes, decoys and weather at this strength."""
 
     rendered_share: float = 0.4
     rendered_scenes: int = 400
     decoy_share: float = 0.3
     scale: float = 1.4
     tilt: float = 0.06
+    closing: float = 0.3
+    closing_strength: float = 0.4
 
 
 def core(labels: Labels, gsd_m: float) -> NDArray[np.bool_]:
@@ -65,15 +68,19 @@ class CropSampler:
         self._inside = [np.argwhere(scene.labelled[::16, ::16]) * 16 for scene in self._real]
         self._rendered = rendered_scenes(config.rendered_scenes, seed) if config.rendered_share > 0.0 else []
 
-    def batch(self, step: int, count: int) -> tuple[Image, Image, Image]:
-        """A step's batch: RGB 0-255 (n, 3, h, w), building and core (n, 2, h, w), weight (n, 1, h, w)."""
+    def batch(self, step: int, count: int, done: float = 0.0) -> tuple[Image, Image, Image]:
+        """A step's batch: RGB 0-255 (n, 3, h, w), building and core (n, 2, h, w), weight (n, 1, h, w).
+
+        ``done`` is the share of the run that lies behind.
+        """
         rng = np.random.default_rng((self._seed, step))
-        rgb, target, weight = zip(*(self._crop(rng) for _ in range(count)), strict=True)
+        strength = self._config.closing_strength if done >= 1.0 - self._config.closing else 1.0
+        rgb, target, weight = zip(*(self._crop(strength, rng) for _ in range(count)), strict=True)
         return np.stack(rgb), np.stack(target), np.stack(weight)[:, None]
 
-    def _crop(self, rng: np.random.Generator) -> tuple[Image, Image, Image]:
+    def _crop(self, strength: float, rng: np.random.Generator) -> tuple[Image, Image, Image]:
         config = self._config
-        is_rendered = rng.random() < config.rendered_share
+        is_rendered = rng.random() < config.rendered_share * strength
         if is_rendered:
             scene = self._rendered[rng.integers(len(self._rendered))]
             centre = rng.uniform(0.3, 0.7, 2) * RENDERED_SIDE_PX
@@ -84,9 +91,9 @@ class CropSampler:
             centre = np.array([column, row]) + rng.uniform(0.0, 16.0, 2)
         to_scene = _warp(centre, TRAIN_GSD_M / scene.gsd_m, rng, config)
         rgb, labels, known = _cut(scene, to_scene)
-        if not is_rendered and rng.random() < config.decoy_share:
+        if not is_rendered and rng.random() < config.decoy_share * strength:
             rgb = decoys(rgb, labels, TRAIN_GSD_M, rng)
-        rgb = augmented(rgb, labels, TRAIN_GSD_M, rng)
+        rgb = augmented(rgb, labels, TRAIN_GSD_M, strength, rng)
         target = np.stack([labels > 0, core(labels, TRAIN_GSD_M)]).astype(np.float32)
         return np.ascontiguousarray(rgb.transpose(2, 0, 1)), target, known.astype(np.float32)
 

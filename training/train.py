@@ -140,7 +140,8 @@ def train(
     started = time.monotonic() - training.seconds
     while training.step < training.steps:
         rgb, target, weight = (
-            torch.from_numpy(a).to(training.device) for a in sampler.batch(training.step, batch)
+            torch.from_numpy(a).to(training.device)
+            for a in sampler.batch(training.step, batch, training.step / training.steps)
         )
         loss, factor = training.advance(rgb, target, weight)
         recent.append(loss)

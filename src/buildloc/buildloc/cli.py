@@ -276,21 +276,24 @@ def _map(args: argparse.Namespace) -> int:
     from buildloc_segmenter.config import SegmenterConfig
     from buildloc_segmenter.segmenter import Segmenter
 
-    from buildloc.map_picture import MapPicture
     from buildloc.mapfile import write_map, write_tum
     from buildloc.settings import MAPPER, SEGMENTER, config_of, load
 
     settings = load(args.config, [*_registration(args), *args.overrides])
     segmenter = Segmenter(config_of(settings, SEGMENTER, SegmenterConfig))
     mapper = Mapper(config_of(settings, MAPPER, MapperConfig))
-    update, picture, refused = None, MapPicture(), list[str]()
+    update, picture, refused = None, None, list[str]()
+    if args.plot is not None:
+        from buildloc.map_picture import MapPicture  # matplotlib is loaded for pictures alone
+
+        picture = MapPicture()
     for frame in _frames(args.bag):
         if isinstance(frame, FrameFault) or (mask := segmenter.process(frame)) is None:
             continue
-        if args.plot is not None:
-            picture.add(frame)
         try:
             update = mapper.add(frame, mask) or update
+            if picture is not None:
+                picture.add(frame)
         except BuildlocError as error:
             refused.append(str(error))
         if update is not None:
@@ -305,7 +308,7 @@ def _map(args: argparse.Namespace) -> int:
     if args.trajectory is not None:
         write_tum(update.keyframes, args.trajectory)
         print(f"{args.trajectory}: {len(update.keyframes)} poses (TUM)")
-    if args.plot is not None:
+    if picture is not None:
         drawn = args.out.with_suffix(".png") if args.plot is True else args.plot
         picture.write(update, drawn, str(args.bag))
         print(f"{drawn}: mosaic of {len(update.keyframes)} images, path, buildings, links")

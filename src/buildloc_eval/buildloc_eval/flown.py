@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -85,11 +86,18 @@ def mapped(
     update = mapper.finish()
     if update is None:
         return Path2d((), (), {}), None
+    path = path_of(update, index_of)
+    path.counts["median_ms_per_keyframe"] = 1e3 * float(np.median(seconds))
+    return path, update
+
+
+def path_of(update: MapUpdate, index_of: Mapping[int, int]) -> Path2d:
+    """The keyframes of a map as images of a flight, whose numbers ``index_of`` gives by stamp, and the map's
+    counts of links and submaps."""
     kept = ("loop_closures", "submaps", "unlinked", "joins", "scale_sigma")
     counts = {k: v for k, v in update.funnel.items() if k in kept or k.startswith("rejected_")}
-    counts["median_ms_per_keyframe"] = 1e3 * float(np.median(seconds))
     poses = tuple(Similarity(k.x_m, k.y_m, k.yaw_rad, k.scale) for k in update.keyframes)
-    return Path2d(tuple(index_of[k.stamp_ns] for k in update.keyframes), poses, counts), update
+    return Path2d(tuple(index_of[k.stamp_ns] for k in update.keyframes), poses, counts)
 
 
 def _evo_path(places_m: FloatArray, yaw_rad: FloatArray) -> PosePath3D:

@@ -25,11 +25,12 @@ from buildloc_mapper.fusion import Fusion, View
 from buildloc_mapper.mapper import MapUpdate
 from buildloc_mapper.similarity import Similarity
 from buildloc_msgs_py.types import FloatArray, LocalMap
+from numpy.typing import NDArray
 
 from buildloc_eval import endurance
 from buildloc_eval.cut import CutFlight, cut
 from buildloc_eval.flight import FlightConfig, follow, tour
-from buildloc_eval.flown import Aligned, Flight, Path2d, align, draw, mapped, unrectified
+from buildloc_eval.flown import Aligned, Flight, Path2d, align, draw, mapped, path_of, unrectified
 from buildloc_eval.html import write_report
 from buildloc_eval.machine import machine
 from buildloc_eval.orthos import LabelledGround, banepa, barnarp
@@ -45,7 +46,7 @@ MAPPED_BY = ("sift", "xfeat")  # coarse_loftr gives the same pairs, and would ta
 COARSE_MAP_GSD_M = 2.0  # for flights whose masks are empty
 TOUR = FlightConfig(length_m=2000.0, speed_mps=5.0, altitude_swing_m=10.5, tilt_deg=3.0)
 BIAS = 1.03
-QUICK_IMAGES = 60
+QUICK_IMAGES, QUICK_LENGTH_M = 60, 1000.0
 KEYFRAMES, QUICK_KEYFRAMES = 1000, 150
 CODE = ("buildloc_eval", "buildloc_mapper", "buildloc_msgs_py")
 IMAGERY = {
@@ -194,21 +195,24 @@ def tilted_scores(data: Path, config: MapperConfig, folder: Path, images: int | 
     return _fly(survey, flat, {"plain_chaining": chain(plain)}, folder, with_scale=True).scores
 
 
-def cut_flight(ground: LabelledGround, seed: int, altitude_factor: float = 1.0) -> CutFlight:
+def round_trip(
+    ground: LabelledGround, flown: FlightConfig, seed: int, altitude_factor: float = 1.0
+) -> CutFlight:
     """A round trip over an orthophoto."""
-    path = tour(ground.flown_m(), TOUR, seed)
-    trajectory = follow(path, math.inf, TOUR, seed)
-    return cut(ground.name, ground.picture, ground.labels, trajectory, TOUR, seed, altitude_factor)
+    path = tour(ground.flown_m(), flown, seed)
+    trajectory = follow(path, math.inf, flown, seed)
+    return cut(ground.name, ground.picture, ground.labels, trajectory, flown, seed, altitude_factor)
 
 
-def cut_scores(ground: LabelledGround, config: MapperConfig, folder: Path, seed: int) -> Scores:
-    """Trajectory and buildings of a flight over an orthophoto."""
-    flight = cut_flight(ground, seed)
+def cut_scores(
+    flight: CutFlight, buildings: NDArray[np.object_], config: MapperConfig, folder: Path
+) -> Scores:
+    """Trajectory of a flight over an orthophoto, and its map against the true outlines (N,)."""
     found, _ = links(flight, config, unrectified)
     plain, (without, _) = chain(found), mapped(flight, replace(config, loop_tests=0))
     others = {"without_loop_closures": without, "plain_chaining": plain}
     flown = _fly(flight, config, others, folder)
-    true = shapely.get_coordinates(shapely.centroid(ground.buildings))
+    true = shapely.get_coordinates(shapely.centroid(buildings))
     maps = {"plain_chaining": plain_map(flight, plain, config)}
     if flown.update is not None:
         maps["mapper"] = flown.update.local_map
@@ -218,30 +222,33 @@ def cut_scores(ground: LabelledGround, config: MapperConfig, folder: Path, seed:
     return flown.scores
 
 
-def bias_scores(ground: LabelledGround, config: MapperConfig, seed: int) -> Scores:
-    """The same flight with an altimeter that says too much: the map is as much too large, and the standard
-    deviation that it tells of its scale allows for it."""
-    path, update = mapped(cut_flight(ground, seed, BIAS), config)
-    aligned = align(cut_flight(ground, seed), path, with_scale=True)
+def bias_scores(flight: CutFlight, config: MapperConfig) -> Scores:
+    """A flight with an altimeter that says too much: the map is as much too large, and the standard deviation
+    that it tells of its scale allows for it."""
+    path, update = mapped(flight, config)
+    aligned = align(flight, path, with_scale=True)
     if update is None or aligned is None:
         return {}
     larger, sigma = 1.0 / aligned.scores["scale"], update.funnel["scale_sigma"]
     return {
-        "altitude_told_over_true": BIAS, "map_over_world": larger,
-        "scale_error_percent": 100.0 * abs(larger / BIAS - 1.0),
+        "altitude_told_over_true": flight.altitude_factor, "map_over_world": larger,
+        "scale_error_percent": 100.0 * abs(larger / flight.altitude_factor - 1.0),
         "scale_sigma_told": sigma, "scale_in_sigmas": abs(math.log(larger)) / sigma,
         "similarity_alignment": aligned.scores,
     }  # fmt: skip
 
 
-def endurance_scores(
-    ground: LabelledGround, config: MapperConfig, folder: Path, seed: int, keyframes: int, progress: Progress
-) -> Scores:
-    """Cost of a keyframe over a long flight, and how far it is from the truth at its end."""
-    flight = endurance.long_flight(ground, keyframes, seed)
+def endurance_scores(flight: CutFlight, config: MapperConfig, folder: Path, progress: Progress) -> Scores:
+    """Cost of a keyframe over a long flight, memory, and the trajectory."""
     load = endurance.endure(flight, config, progress)
     endurance.draw(load, folder / "endurance.png")
-    return {**endurance.scores(flight, load), PICTURES: [("endurance: cost of a keyframe", "endurance.png")]}
+    scores: Scores = endurance.scores(flight, load)
+    scores[PICTURES] = [("endurance: cost of a keyframe", "endurance.png")]
+    if load.update is not None:
+        path = path_of(load.update, {stamp: i for i, stamp in enumerate(flight.stamps_ns)})
+        if (aligned := align(flight, path, with_scale=False)) is not None:
+            scores["mapper"] = aligned.scores
+    return scores
 
 
 def plan(data: Path, folder: Path, seed: int, quick: bool, progress: Progress) -> dict[str, Make]:
@@ -257,12 +264,19 @@ def plan(data: Path, folder: Path, seed: int, quick: bool, progress: Progress) -
         if name in methods:
             images = QUICK_IMAGES if quick else None
             parts[f"sheffield_flight_{name}"] = partial(tilted_scores, data, methods[name], folder, images)
-    parts["barnarp"] = lambda: cut_scores(town(), sift, folder, seed)
-    if not quick:
-        parts["banepa_ortho"] = lambda: cut_scores(dense(), sift, folder, seed)
-    parts["altitude_bias"] = lambda: bias_scores(town(), sift, seed)
+    flown = replace(TOUR, length_m=QUICK_LENGTH_M) if quick else TOUR
     count = QUICK_KEYFRAMES if quick else KEYFRAMES
-    parts["endurance"] = lambda: endurance_scores(town(), sift, folder, seed, count, progress)
+
+    def over(ground: LabelledGround) -> Scores:
+        return cut_scores(round_trip(ground, flown, seed), ground.buildings, sift, folder)
+
+    parts["barnarp"] = lambda: over(town())
+    if not quick:
+        parts["banepa_ortho"] = lambda: over(dense())
+    parts["altitude_bias"] = lambda: bias_scores(round_trip(town(), flown, seed, BIAS), sift)
+    parts["endurance"] = lambda: endurance_scores(
+        endurance.long_flight(town(), count, seed), sift, folder, progress
+    )
     return parts
 
 

@@ -270,7 +270,9 @@ def invented(
 
 
 def summary(places: dict[str, SegmentationErrors]) -> Sequence[str]:
-    """A table for people."""
+    """A table for people, empty without places."""
+    if not places:
+        return []
     lines = [
         f"{'error model':<24} missed merged  split  f/km2 centre  frame area_b area_s line_m flicker again"
     ]

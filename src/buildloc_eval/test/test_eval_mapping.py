@@ -10,15 +10,33 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shapely
+from buildloc_eval.cut import cut
+from buildloc_eval.flight import FlightConfig, follow
 from buildloc_eval.flown import Path2d, align
-from buildloc_eval.mapping import Bar, bar_table, building_scores, configs, pair_table, path_table
+from buildloc_eval.mapping import (
+    BARS,
+    Bar,
+    bar_table,
+    bias_scores,
+    building_scores,
+    configs,
+    cut_scores,
+    pair_table,
+    path_table,
+    plan,
+)
 from buildloc_eval.pairs import chain, links, pair_scores
+from buildloc_eval.sections import PICTURES
 from buildloc_eval.survey import LEVEL, Survey, attitude_of, mirafiori, sheffield
+from buildloc_eval.world import PictureWorld
+from buildloc_mapper.config import MapperConfig
 from buildloc_mapper.registration import Link
 from buildloc_mapper.similarity import Similarity
 from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.ground import heading_rad, rotation_matrix
 from buildloc_msgs_py.types import CameraModel, LocalMap
+from textured import BUILDINGS, GSD, WORLD, WORLD_MASK
 
 DATA = Path(os.environ.get("BUILDLOC_DATA", Path(__file__).parents[4] / "shared" / "data"))
 YAW = np.array([0.3, 0.4, 2.0, 2.1, -1.0])
@@ -146,6 +164,40 @@ def test_only_buildings_seen_whole_are_scored() -> None:
     scores = building_scores(found, turned, true)
     assert (scores["buildings"], scores["median_m"]) == (2, pytest.approx(0.25))
     assert building_scores(found.select(cut), turned, true) == {"buildings": 0}
+
+
+def test_a_quick_run_is_a_part_of_the_whole_and_every_bar_has_its_section(tmp_path: Path) -> None:
+    quick, whole = (list(plan(tmp_path, tmp_path, 1, q, lambda text: None)) for q in (True, False))
+    assert set(quick) < set(whole) and "sheffield_flight_sift" in quick
+    assert {bar.section for bar in BARS} <= set(whole)
+
+
+def test_a_flight_over_drawn_ground_is_scored_in_every_way(tmp_path: Path) -> None:
+    """80 m out and 60 m to the side; what the report's figures and pictures are made of."""
+    picture, labels = (PictureWorld(image, 32632, -120.0, 120.0, GSD) for image in (WORLD, WORLD_MASK))
+    config = FlightConfig(
+        altitude_m=55.0,
+        altitude_swing_m=3.0,
+        tilt_deg=2.0,
+        width=320,
+        height=240,
+        hfov_deg=62.0,
+        speed_mps=4.0,
+    )
+    corners = np.array([(-45.0, -10.0), (40.0, 0.0), (35.0, 50.0)])
+    trajectory = follow(corners, math.inf, config, 2)
+    flight = cut("drawn", picture, labels, trajectory, config, 2)
+    houses = np.array([shapely.box(x - w / 2, y - h / 2, x + w / 2, y + h / 2) for x, y, w, h in BUILDINGS])
+    scores = cut_scores(flight, houses, MapperConfig(), tmp_path)
+    for way in ("mapper", "without_loop_closures", "plain_chaining"):
+        assert scores[way]["of"] == len(flight) and scores[way]["rmse_m"] < 10.0
+    assert scores["mapper"]["images"] == len(flight)
+    assert scores["mapper"]["rmse_m"] < min(1.0, scores["plain_chaining"]["rmse_m"])
+    assert scores["mapper"]["buildings"]["median_m"] < 1.0
+    assert all((tmp_path / file).stat().st_size > 10_000 for _, file in scores[PICTURES])
+    assert len(path_table({"drawn": scores}).splitlines()) == 4
+    high = bias_scores(replace(flight, altitude_factor=1.03), MapperConfig())
+    assert high["map_over_world"] == pytest.approx(1.03, abs=0.01)
 
 
 def test_absent_flights_are_one_line(tmp_path: Path) -> None:

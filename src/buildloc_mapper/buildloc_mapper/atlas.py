@@ -53,7 +53,7 @@ class Atlas:
 
     def __init__(self, config: MapperConfig) -> None:
         self._config = config
-        self._registration = Registration(config)
+        self.registration = Registration(config)
         self.reset()
 
     def reset(self) -> None:
@@ -72,13 +72,17 @@ class Atlas:
         """Capture time of a keyframe."""
         return self._keyframes[keyframe].stamp_ns
 
+    def prepared(self, keyframe: int) -> Prepared:
+        """A keyframe as registration takes it."""
+        return self._keyframes[keyframe].unpacked()
+
     def submaps(self) -> list[PoseGraph]:
         """Every submap once, the oldest first."""
         return list({id(graph): graph for graph in self._submaps}.values())
 
     def add(self, frame: Frame) -> int:
         """Link a frame later than all before; its id. It stays a submap of its own until something links."""
-        prepared = self._registration.prepare(frame)
+        prepared = self.registration.prepare(frame)
         keyframe = len(self._keyframes)
         self._keyframes.append(_Keyframe(frame.stamp_ns, prepared))
         first = self._latest_link(keyframe, prepared)
@@ -105,7 +109,7 @@ class Atlas:
     def _register(
         self, earlier: int, keyframe: int, prepared: Prepared, kind: str, turned_rad: float | None = None
     ) -> Edge | None:
-        link = self._registration.register(self._keyframes[earlier].unpacked(), prepared, turned_rad)
+        link = self.registration.register(self._keyframes[earlier].unpacked(), prepared, turned_rad)
         return self._edge(link, earlier, keyframe, kind)
 
     def _edge(self, link: Link | Rejection, earlier: int, keyframe: int, kind: str) -> Edge | None:
@@ -129,7 +133,7 @@ class Atlas:
             if self._submaps[earlier] is not graph:
                 continue
             rough = graph.poses[earlier].inverse().compose(guess)
-            link = self._registration.follow(self._keyframes[earlier].unpacked(), prepared.level, rough)
+            link = self.registration.follow(self._keyframes[earlier].unpacked(), prepared.level, rough)
             if (edge := self._edge(link, earlier, first.later, "skip_")) is not None:
                 yield edge
 

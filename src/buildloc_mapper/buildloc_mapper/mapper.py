@@ -48,7 +48,7 @@ class Mapper:
         check(config)
         self.config = config
         self._atlas = Atlas(config)
-        self._tracker = Tracker(config)
+        self._tracker = Tracker(config, self._atlas.registration)
         self.reset()
 
     def reset(self) -> None:
@@ -89,7 +89,7 @@ class Mapper:
         T_new_old = None  # noqa: N806
         if before is not None and before in graph.poses:
             T_new_old = graph.poses[keyframe].inverse().compose(graph.poses[before])  # noqa: N806
-        self._tracker.rebase(keyframe, frame, T_new_old)
+        self._tracker.rebase(keyframe, frame.stamp_ns, self._atlas.prepared(keyframe), T_new_old)
         return self._update(keyframe, started)
 
     def track(self, frame: Frame) -> Tracked | Lost:

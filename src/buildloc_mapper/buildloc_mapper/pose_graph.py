@@ -154,7 +154,7 @@ class PoseGraph:
         self._turns: list[Turn] = []
         self.edges: list[Edge] = []
         self.poses: dict[int, Similarity] = {}
-        self._covariances: dict[int, FloatArray] = {}  # asked for since the last change
+        self._covariances: dict[int, FloatArray] = {}  # asked for since the last keyframe
         self._isam = gtsam.ISAM2(_parameters())
 
     def add(
@@ -166,6 +166,7 @@ class PoseGraph:
         turns: Iterable[Turn] = (),
     ) -> None:
         """Add a keyframe later than all before, with its links to them; ``poses`` are optimised anew."""
+        self._covariances.clear()
         before = next(reversed(self._stamps_ns), None)
         self._stamps_ns[keyframe] = stamp_ns
         factors = _keyframe_factors(keyframe, before, self._stamps_ns, self._config)
@@ -197,7 +198,8 @@ class PoseGraph:
 
     def covariance(self, keyframe: int) -> FloatArray:
         """(4, 4) of a keyframe's pose over x, y, yaw and log scale, as seen from the first keyframe; the
-        altimeter's bias is not in it."""
+        altimeter's bias is not in it. It is computed once between two keyframes, when it is first
+        asked for: links that come after make it smaller than it says."""
         if keyframe in self._covariances:
             return self._covariances[keyframe]
         pose = self.poses[keyframe]
@@ -236,7 +238,6 @@ class PoseGraph:
         self._isam.update(graph, _values(guesses))
         for _ in range((LOOP_ROUNDS if any(edge.loop for edge in edges) else ROUNDS) - 1):
             self._isam.update()
-        self._covariances.clear()
         self.edges += edges
         self._turns += turns
         self.poses = self._poses_of(self._isam.calculateEstimate())

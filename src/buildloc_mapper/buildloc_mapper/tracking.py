@@ -13,9 +13,6 @@ from buildloc_mapper.level import level_image
 from buildloc_mapper.registration import Link, Prepared, Registration, Rejection, link_covariance
 from buildloc_mapper.similarity import Similarity
 
-LEVEL_WIDTH_PX = 480
-FEATURE_WIDTH_PX = 400
-FEATURES = 500
 NOWHERE = Similarity(0.0, 0.0, 0.0, 1.0)
 
 
@@ -55,31 +52,37 @@ class _Motion:
         return self.pose.compose(Similarity(share * x, share * y, share * yaw, scale**share))
 
 
-class Tracker:
-    """Follows the corners of the current keyframe from where a steady motion puts them; where that fails, a
-    small SIFT finds them again. It works on images half as wide as those of the map."""
+@dataclass(frozen=True)
+class _Base:
+    """The keyframe that frames are tracked against."""
 
-    def __init__(self, config: MapperConfig) -> None:
-        self._config = replace(
-            config, registration="sift", level_width_px=min(LEVEL_WIDTH_PX, config.level_width_px),
-            feature_width_px=FEATURE_WIDTH_PX, features=FEATURES,
-        )  # fmt: skip
-        self._registration = Registration(self._config)
+    keyframe: int
+    stamp_ns: int
+    prepared: Prepared
+
+
+class Tracker:
+    """Follows the corners of the current keyframe from where a steady motion puts them; where that fails,
+    the frame is registered as a keyframe would be."""
+
+    def __init__(self, config: MapperConfig, registration: Registration) -> None:
+        self._config, self._registration = config, registration
         self.reset()
 
     def reset(self) -> None:
         """Forget the flight."""
-        self._frame: Frame | None = None
-        self._keyframe = -1
-        self._prepared: Prepared | None = None
+        self._base: _Base | None = None
         self._motion: _Motion | None = None
 
-    def rebase(self, keyframe: int, frame: Frame, T_new_old: Similarity | None) -> None:  # noqa: N803
-        """Track against another keyframe, in which the one before lies at ``T_new_old``; None: unknown.
-
-        Costs nothing until a frame is tracked.
-        """
-        self._keyframe, self._frame, self._prepared = keyframe, frame, None
+    def rebase(
+        self,
+        keyframe: int,
+        stamp_ns: int,
+        prepared: Prepared,
+        T_new_old: Similarity | None,  # noqa: N803
+    ) -> None:
+        """Track against another keyframe, in which the one before lies at ``T_new_old``; None: unknown."""
+        self._base = _Base(keyframe, stamp_ns, prepared)
         if self._motion is not None and T_new_old is not None:
             self._motion = replace(self._motion, pose=T_new_old.compose(self._motion.pose))
         else:
@@ -88,25 +91,22 @@ class Tracker:
     def track(self, frame: Frame) -> Tracked | Lost:
         """Where a frame is. Raises WireError for unusable telemetry."""
         validate_frame(frame)
-        if self._frame is None:
+        if (base := self._base) is None:
             return Lost(frame.stamp_ns, "no_keyframe")
-        if self._prepared is None:
-            self._prepared = self._registration.prepare(self._frame)
-        link = self._follow(self._prepared, frame)
+        link = self._follow(base, frame)
         if not isinstance(link, Link):
-            link = self._registration.register(self._prepared, self._registration.prepare(frame))
+            link = self._registration.register(base.prepared, self._registration.prepare(frame))
         if not isinstance(link, Link):
             self._motion = None
             return Lost(frame.stamp_ns, link.reason)
         self._moved(frame.stamp_ns, link.transform)
         covariance = link_covariance(link, self._config)
-        return Tracked(frame.stamp_ns, self._keyframe, link.transform, covariance, link.inliers)
+        return Tracked(frame.stamp_ns, base.keyframe, link.transform, covariance, link.inliers)
 
-    def _follow(self, prepared: Prepared, frame: Frame) -> Link | Rejection:
-        assert self._frame is not None
-        start = self._motion or _Motion(self._frame.stamp_ns, NOWHERE, NOWHERE, 0.0)
+    def _follow(self, base: _Base, frame: Frame) -> Link | Rejection:
+        start = self._motion or _Motion(base.stamp_ns, NOWHERE, NOWHERE, 0.0)
         level = level_image(frame, self._config.level_width_px)
-        return self._registration.follow(prepared, level, start.at(frame.stamp_ns))
+        return self._registration.follow(base.prepared, level, start.at(frame.stamp_ns))
 
     def _moved(self, stamp_ns: int, pose: Similarity) -> None:
         before, seconds = self._motion, 0.0

@@ -96,6 +96,22 @@ def test_loop_closures_take_most_of_the_drift_out() -> None:
     assert flown.place_sigma_m(last) < 0.7 * blind.place_sigma_m(last)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_two_false_loop_closures_of_ten_change_little(seed: int) -> None:
+    truth, edges = laps(seed)
+    rng = np.random.default_rng(seed + 50)
+    loops = [i for i, e in enumerate(edges) if e.loop]
+    false = list(edges)
+    for i in rng.permutation(loops)[:2]:
+        false[i] = replace(edges[i], transform=noisy(edges[i].transform, rng, (20.0, 20.0, 0.5, 0.05)))
+
+    def rmse(graph: PoseGraph) -> float:
+        off = [math.dist(graph.poses[i][:2], truth[i][:2]) for i in range(len(truth))]
+        return float(np.sqrt(np.mean(np.square(off))))
+
+    assert rmse(chained(false)) < rmse(chained(edges)) + 0.5  # a link's own sigma, in metres
+
+
 def test_the_told_uncertainty_of_a_place_is_that_of_many_flights() -> None:
     """Links with the noise that the graph is told, and no other: errors over sigma are those of a normal."""
     rng, over = np.random.default_rng(5), []

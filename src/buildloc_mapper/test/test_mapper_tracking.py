@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from buildloc_mapper.config import MapperConfig
 from buildloc_mapper.mapper import Mapper
+from buildloc_mapper.registration import Registration
 from buildloc_mapper.similarity import Similarity, compose_covariance
 from buildloc_mapper.tracking import Lost, Tracked, Tracker
 from buildloc_msgs_py.types import Frame
@@ -17,6 +18,7 @@ from textured import shoot, tilt
 
 TENTH = 10**8  # of a second
 CONFIG = MapperConfig()
+REGISTRATION = Registration(CONFIG)
 
 
 def at(tenth: int, x: float, y: float, yaw: float = 0.0, altitude: float = 60.0) -> Frame:
@@ -30,8 +32,8 @@ def tracked(tracker: Tracker, frame: Frame) -> Tracked:
 
 
 def based(frame: Frame) -> Tracker:
-    tracker = Tracker(CONFIG)
-    tracker.rebase(3, frame, None)
+    tracker = Tracker(CONFIG, REGISTRATION)
+    tracker.rebase(3, frame.stamp_ns, REGISTRATION.prepare(frame), None)
     return tracker
 
 
@@ -42,7 +44,7 @@ def test_frames_of_a_flight_are_where_they_were_taken() -> None:
         x, y, yaw = -20.0 + 3.0 * i, 0.1 * i * i, math.radians(4.0 * i)
         found = tracked(tracker, at(2 * i, x, y, yaw, 60.0 + 0.3 * i))
         assert (found.stamp_ns, found.keyframe) == (2 * i * TENTH, 3)
-        # Half a pixel of the tracker's images, 0.15 m.
+        # Half a pixel of 0.15 m.
         assert found.T_keyframe_frame[:2] == pytest.approx((x + 20.0, y), abs=0.07)
         assert found.T_keyframe_frame.yaw_rad == pytest.approx(yaw, abs=0.003)
         assert found.T_keyframe_frame.scale == pytest.approx(1.0, abs=0.004)
@@ -72,9 +74,9 @@ def test_what_cannot_be_tracked_is_lost_and_the_next_frame_is_not() -> None:
 
 
 def test_before_the_first_keyframe_and_after_a_reset_there_is_nothing_to_track_against() -> None:
-    tracker = Tracker(CONFIG)
+    tracker = Tracker(CONFIG, REGISTRATION)
     assert tracker.track(at(1, 0.0, 0.0)) == Lost(TENTH, "no_keyframe")
-    tracker.rebase(0, at(0, 0.0, 0.0), None)
+    tracker.rebase(0, 0, REGISTRATION.prepare(at(0, 0.0, 0.0)), None)
     tracked(tracker, at(1, 0.0, 0.0))
     tracker.reset()
     assert tracker.track(at(2, 0.0, 0.0)) == Lost(2 * TENTH, "no_keyframe")
@@ -85,7 +87,8 @@ def test_a_new_keyframe_takes_the_motion_over() -> None:
     for i in (1, 2, 3):
         tracked(tracker, at(4 * i, -20.0 + 8.0 * i, 0.0))
     # 32 m from the old keyframe, 12 m from the new one: 80 px, far beyond what corners can be followed from.
-    tracker.rebase(4, at(11, 0.0, 0.0), Similarity(-20.0, 0.0, 0.0, 1.0))
+    keyframe = at(11, 0.0, 0.0)
+    tracker.rebase(4, keyframe.stamp_ns, REGISTRATION.prepare(keyframe), Similarity(-20.0, 0.0, 0.0, 1.0))
     found = tracked(tracker, at(16, 12.0, 0.0))
     assert found.keyframe == 4 and found.T_keyframe_frame[:2] == pytest.approx((12.0, 0.0), abs=0.1)
 
