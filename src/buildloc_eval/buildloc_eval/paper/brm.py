@@ -135,17 +135,23 @@ def search(reference: RatioMap, ratios: FloatArray, path_m: FloatArray) -> Survi
 
     None survive where every threshold removes all.
     """
-    residuals = [_residual(reference, query) for query in ratios]
+    reach = math.ceil(float(np.hypot(*(path_m - path_m[0]).T).max()) / CELL_M) + 1
+    width = reference.ratios.shape[2] + 2 * reach
+    # A border that no threshold passes: hypotheses that leave the map end there.
+    residuals = [np.pad(_residual(reference, query), reach, constant_values=255).ravel() for query in ratios]
+    # Every second cell: the tolerance covers those between.
+    first = residuals[0].reshape(-1, width)[reach:-reach:2, reach:-reach:2]
     for threshold in THRESHOLDS:
-        level = threshold * UNITS
-        # Every second cell: the tolerance covers those between.
-        start = 2 * np.column_stack(np.nonzero(residuals[0][::2, ::2] <= level))
+        row, column = np.nonzero(first <= threshold * UNITS)
+        start = (2 * row + reach) * width + 2 * column + reach
         found = [
-            _propagate(residuals, start, path_m, 2.0 * math.pi * h / HEADINGS, level) for h in range(HEADINGS)
+            _propagate(residuals, width, start, path_m, 2.0 * math.pi * h / HEADINGS, threshold * UNITS)
+            for h in range(HEADINGS)
         ]
-        cells = np.concatenate([places for places, _ in found])
+        cells = np.concatenate([cells for cells, _ in found])
         if len(cells):
-            return Survivors(reference.places_m(cells), np.concatenate([mean for _, mean in found]))
+            places = np.column_stack([cells % width, cells // width]) - float(reach)
+            return Survivors(reference.places_m(places), np.concatenate([mean for _, mean in found]))
     return Survivors(np.empty((0, 2)), np.empty(0))
 
 
@@ -160,24 +166,20 @@ def _residual(reference: RatioMap, query: FloatArray) -> ByteArray:
 
 def _propagate(
     residuals: Sequence[ByteArray],
+    width: int,
     start: NDArray[np.int64],
     path_m: FloatArray,
     heading_rad: float,
     level: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Cells (H, 2) column, row of the last keyframe, and mean residuals (H,), of what starts in cells (S, 2)
-    row, column, at one heading and stays at or below the level."""
-    rows, columns = residuals[0].shape
+) -> tuple[NDArray[np.int64], FloatArray]:
+    """Cells (H,) of the last keyframe, and mean residuals (H,), of what starts in cells (S,) at one heading
+    and stays at or below the level. Cells are numbered along rows of ``width``."""
     c, s = math.cos(heading_rad), math.sin(heading_rad)
-    moves = np.round((path_m - path_m[0]) @ np.array([[c, s], [-s, c]]) / CELL_M).astype(np.int64)
-    row, column = start.T
-    total = residuals[0][row, column].astype(np.float64)
-    for residual, (right, up) in zip(residuals[1:], moves[1:], strict=True):
-        at_row, at_column = row + up, column + right
-        inside = (at_row >= 0) & (at_row < rows) & (at_column >= 0) & (at_column < columns)
-        row, column, total = row[inside], column[inside], total[inside]
-        here = residual[row + up, column + right]
+    right, up = np.round((path_m - path_m[0]) @ np.array([[c, s], [-s, c]]) / CELL_M).astype(np.int64).T
+    moves = (up * width + right).tolist()
+    total = residuals[0][start].astype(np.int32)
+    for residual, move in zip(residuals[1:], moves[1:], strict=True):
+        here = residual[start + move]
         alive = here <= level
-        row, column, total = row[alive], column[alive], total[alive] + here[alive]
-    last = np.column_stack([column + moves[-1, 0], row + moves[-1, 1]]).astype(np.float64)
-    return last, total / (UNITS * len(residuals))
+        start, total = start[alive], total[alive] + here[alive]
+    return start + moves[-1], total / (UNITS * len(residuals))
