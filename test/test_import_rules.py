@@ -32,7 +32,10 @@ ONLY_IN = {
     "onnxruntime": {"buildloc_segmenter.network", "buildloc_mapper.network"},
     "gtsam": {"buildloc_mapper.pose_graph"},
 }
-WORLD_SIMULATION = {f"buildloc_eval.{name}" for name in ("world", "town", "flight", "camera", "sim")}
+WORLD_SIMULATION = {
+    f"buildloc_eval.{name}"
+    for name in ("world", "town", "flight", "camera", "sim", "orthos", "paper.flights", "paper.texture")
+}
 NAMES_GROUND_TRUTH = {"buildloc_msgs_py.topics"}  # where the topic is spelt
 NODE_LINES = 160
 

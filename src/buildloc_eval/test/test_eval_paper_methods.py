@@ -17,7 +17,7 @@ from buildloc_eval.paper.flown import Maps, Snapshot
 from buildloc_eval.paper.methods import BRM, STARS, Prediction
 from buildloc_eval.paper.plan import Models, Plan, Stores, maps_name, ragged
 from buildloc_eval.paper.published import FLIGHTS
-from buildloc_eval.paper.report import write
+from buildloc_eval.paper.report import held, write
 from buildloc_eval.paper.scoring import (
     Score,
     bins_within,
@@ -232,13 +232,23 @@ def test_recall_has_an_interval_and_errors_are_of_the_right_ones() -> None:
     assert error_row(scores[-1:])["final_median_m"] is None
 
 
-def test_kept_results_are_made_once(tmp_path: Path) -> None:
-    store, made = Store(tmp_path / "stage", {"seed": 1}), []
-    for _ in range(2):
-        assert store.get("one", lambda: made.append(1) or 5) == 5
-    assert made == [1]
-    assert Store(tmp_path / "stage", {"seed": 1}).load("one") == 5
-    assert not list((tmp_path / "stage").glob("*.part"))
+@pytest.mark.parametrize(
+    ("bar", "value", "more", "answer"),
+    [(0.97, 0.98, True, True), (0.97, 0.9, True, False), (30.0, 20.0, False, True), (30.0, None, False, False),
+     (None, 0.5, True, None)],
+)  # fmt: skip
+def test_a_bar_is_held_by_a_value_alone(
+    bar: float | None, value: float | None, more: bool, answer: bool | None
+) -> None:
+    assert held(bar, value, more) is answer
+
+
+def test_results_are_kept_whole(tmp_path: Path) -> None:
+    store = Store(tmp_path / "stage", {"seed": 1})
+    assert not store.has("one")
+    store.save("one", {"a": 5})
+    assert Store(tmp_path / "stage", {"seed": 1}).load("one") == {"a": 5}
+    assert {path.name for path in store.folder.iterdir()} == {"made_by.json", "one.pickle"}
 
 
 def test_results_of_another_configuration_or_code_are_refused(tmp_path: Path) -> None:
@@ -277,6 +287,7 @@ def test_a_run_is_predicted_scored_and_reported_and_goes_on_where_it_was(
     text = write(tmp_path, stores, [flight], plan, models, 1, True, 12.0)
     report = json.loads((tmp_path / "report.json").read_text())
     assert list(report)[:3] == ["evaluation", "what is real", "not done"]
+    assert [row["what"].split(",")[0] for row in report["bars"]] == ["minutes of this run"]
     recall = {(row["method"], row["metric"]): row for row in report["recall"]}
     assert recall["default preset", "R@1"]["1 km"].startswith("1.000 [0.21, 1.00]")
     assert recall["paper preset", "R@1"]["paper, 1 km"] == "7/7"

@@ -7,8 +7,7 @@ import importlib
 import json
 import os
 import pickle
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +28,6 @@ def code_hash(modules: Sequence[str]) -> str:
         for path in sorted(file.parent.rglob("*.py")) if file.name == "__init__.py" else [file]:
             digest.update(path.name.encode() + path.read_bytes())
     return digest.hexdigest()[:16]
-
-
-def described(*configs: Any) -> Any:
-    """Config dataclasses as JSON has them."""
-    return json.loads(json.dumps([asdict(config) for config in configs]))
 
 
 class Store:
@@ -72,12 +66,6 @@ class Store:
     def save(self, name: str, value: Any) -> None:
         """Keep a result."""
         _write(self.path(name), pickle.dumps(value))
-
-    def get(self, name: str, make: Callable[[], Any]) -> Any:
-        """The result, made if it is not there."""
-        if not self.has(name):
-            self.save(name, make())
-        return self.load(name)
 
 
 def _write(path: Path, data: bytes) -> None:
