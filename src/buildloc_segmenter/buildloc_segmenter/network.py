@@ -23,7 +23,8 @@ from buildloc_segmenter.instances import FloatImage, Instances, draw_mask, find_
 from buildloc_segmenter.outlines import Building, buildings
 from buildloc_segmenter.tiles import Block, blocks, starts
 
-SHIPPED = "models/buildings_lite0.onnx"
+# Networks that come with the package, by the value of the parameter model.
+SHIPPED = {"": "models/buildings_lite0.onnx", "int8": "models/buildings_lite0_int8.onnx"}
 CPU = "CPUExecutionProvider"
 TILE_PX = 1024  # larger inputs go through in tiles: memory stays bounded
 OVERLAP_PX = 96
@@ -67,9 +68,7 @@ class Network:
     def __init__(self, config: SegmenterConfig) -> None:
         self.contract = contract_of(config)
         self._config = config
-        self._path = Path(
-            config.model or str(importlib.resources.files("buildloc_segmenter").joinpath(SHIPPED))
-        )
+        self._path = _path(config.model)
         self._session = _load(self._path, config)
         self.provider: str = self._session.get_providers()[0]
         self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
@@ -292,6 +291,13 @@ class Network:
         if max(strides) > min(MAX_STRIDE, 1.1 * min(strides)):
             raise self._wrong("layout", f"an output {list(output.shape)} for {size[1]}x{size[0]} pixels")
         return values
+
+
+def _path(model: str) -> Path:
+    """The file of the parameter model."""
+    if model not in SHIPPED:
+        return Path(model)
+    return Path(str(importlib.resources.files("buildloc_segmenter").joinpath(SHIPPED[model])))
 
 
 def _load(path: Path, config: SegmenterConfig) -> onnxruntime.InferenceSession:
