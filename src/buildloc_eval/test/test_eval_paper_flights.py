@@ -23,6 +23,7 @@ from buildloc_eval.paper.differences import (
 )
 from buildloc_eval.paper.flights import (
     CENTRES_M,
+    PaperFlight,
     SiteError,
     choose,
     environment,
@@ -170,13 +171,20 @@ def test_the_reference_lacks_what_another_digitiser_and_automatic_mapping_lack()
     assert len(found) == pytest.approx(0.79 * 0.97 * len(true), rel=0.03)
 
 
-def test_the_texture_lies_under_the_whole_flight(monkeypatch: pytest.MonkeyPatch) -> None:
-    picture = PictureWorld(np.zeros((80, 100, 3), dtype=np.uint8), 32633, 5e5, 6e6, 10.0)
+@pytest.mark.parametrize("flight", paper_flights(), ids=lambda flight: str(flight.number))
+def test_no_frame_sees_where_the_seams_of_the_texture_cross(
+    flight: PaperFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    size = (139, 82)  # Barnarp, the smaller one, in steps of 10 m
+    picture = PictureWorld(np.zeros((*size[::-1], 3), dtype=np.uint8), 32633, 5e5, 6e6, 10.0)
     monkeypatch.setattr(texture, "GROUNDS", (lambda _: SimpleNamespace(picture=picture),))
-    flight = paper_flights()[5]
-    west, south, east, north = texture.ground_texture(Path(), flight, np.random.default_rng(1)).bounds_m
     path, reach = trajectory(flight, 1).xy_m, margin_m(flight_config(flight.like))
-    assert (path - reach > (west, south)).all() and (path + reach < (east, north)).all()
+    for seed in range(5):
+        world = texture.ground_texture(Path(), flight, np.random.default_rng(seed))
+        west, _, east, north = world.bounds_m
+        assert (path[:, 0] - reach > west).all() and (path[:, 0] + reach < east).all()
+        assert (path[:, 1] + reach < north).all() and (path[:, 1] - reach > north - 820.0).all()
+        assert path[:, 0].min() < west + 1390.0 < path[:, 0].max()  # the one seam that is crossed
 
 
 def test_snow_is_more_false_buildings() -> None:

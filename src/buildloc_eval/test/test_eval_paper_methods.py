@@ -234,9 +234,14 @@ def test_recall_has_an_interval_and_errors_are_of_the_right_ones() -> None:
 
 @pytest.mark.parametrize(
     ("bar", "value", "more", "answer"),
-    [(0.97, 0.98, True, True), (0.97, 0.9, True, False), (30.0, 20.0, False, True), (30.0, None, False, False),
-     (None, 0.5, True, None)],
-)  # fmt: skip
+    [
+        (0.97, 0.98, True, True),
+        (0.97, 0.9, True, False),
+        (30.0, 20.0, False, True),
+        (30.0, None, False, False),
+        (None, 0.5, True, None),
+    ],
+)
 def test_a_bar_is_held_by_a_value_alone(
     bar: float | None, value: float | None, more: bool, answer: bool | None
 ) -> None:
