@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,7 +20,10 @@ from numpy.typing import NDArray
 
 IMAGE_WIDTH_PX = 320  # of a keyframe, as it is kept until the end of the flight
 LONGEST_SIDE_PX = 2000
-LINKS = {"skip": "tab:cyan", "loop": "tab:red"}  # the path shows the consecutive ones
+LINKS: dict[str, dict[str, Any]] = {  # the path shows the consecutive ones, above the skip links along it
+    "skip": {"colors": "tab:cyan", "lw": 3.0, "alpha": 0.5, "zorder": 1.5},
+    "loop": {"colors": "tab:red", "lw": 1.6, "zorder": 2.5},
+}
 
 
 @dataclass(frozen=True)
@@ -71,11 +75,10 @@ class MapPicture:
             label = f"{len(drawn)} {name}"
             axes.add_collection(PolyCollection(drawn, fc="none", ec=colour, lw=0.8, label=label))
         axes.plot(*places.T, "o-", c="tab:blue", lw=1.2, ms=3, label=f"path, {len(places)} keyframes")
-        for kind, colour in LINKS.items():
+        for kind, look in LINKS.items():
             ends = [places[[earlier, later]] for earlier, later, of in update.links if of == kind]
             if ends:
-                lines = LineCollection(ends, colors=colour, lw=1.4, label=f"{len(ends)} {kind} links")
-                axes.add_collection(lines)
+                axes.add_collection(LineCollection(ends, label=f"{len(ends)} {kind} links", **look))
         axes.plot(*places[0], "o", c="white", mec="tab:blue", ms=7, label="first keyframe")
         axes.set_xlabel("x, m (buildloc_map)")
         axes.set_ylabel("y, m")

@@ -22,7 +22,9 @@ class SegmenterConfig:
 
     keyframe_rotation_deg: float = param(15.0, "in-plane rotation that makes a keyframe, deg", 0.1, 180.0)
     keyframe_period_s: float = param(5.0, "time that makes a keyframe, s", 0.0, 3600.0)
-    model: str = param("", "path of an ONNX network; empty: the one that is shipped")
+    model: str = param(
+        "", "path of an ONNX network; empty: the one that is shipped, int8: the same quantised"
+    )
     providers: tuple[str, ...] = param(
         ("CPUExecutionProvider",),
         "ONNX Runtime execution providers, by preference; the CPU is the last resort",

@@ -23,7 +23,8 @@ from buildloc_segmenter.instances import FloatImage, Instances, draw_mask, find_
 from buildloc_segmenter.outlines import Building, buildings
 from buildloc_segmenter.tiles import Block, blocks, starts
 
-SHIPPED = "models/buildings_lite0.onnx"
+# Networks that come with the package, by the value of the parameter model.
+SHIPPED = {"": "models/buildings_lite0.onnx", "int8": "models/buildings_lite0_int8.onnx"}
 CPU = "CPUExecutionProvider"
 TILE_PX = 1024  # larger inputs go through in tiles: memory stays bounded
 OVERLAP_PX = 96
@@ -61,16 +62,14 @@ class Network:
 
     Construction loads the file and runs it once on noise. Raises NetworkError, or ConfigError. ``provider``
     is the ONNX Runtime provider that runs it; one that was asked for and does not run is logged.
-    ``metadata``: what the file says of itself.
+    ``path`` is its file, ``metadata`` what that says of itself.
     """
 
     def __init__(self, config: SegmenterConfig) -> None:
         self.contract = contract_of(config)
         self._config = config
-        self._path = Path(
-            config.model or str(importlib.resources.files("buildloc_segmenter").joinpath(SHIPPED))
-        )
-        self._session = _load(self._path, config)
+        self.path = _path(config.model)
+        self._session = _load(self.path, config)
         self.provider: str = self._session.get_providers()[0]
         self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
         own = self.metadata.get(METADATA_KEY)
@@ -79,7 +78,7 @@ class Network:
             try:
                 self.contract = contract_from_json(own)
             except ConfigError as error:
-                raise NetworkError(f"{self._path}: {error}; export it again") from error
+                raise NetworkError(f"{self.path}: {error}; export it again") from error
         inputs = self._session.get_inputs()
         shape = inputs[0].shape
         if len(inputs) != 1 or len(shape) != 4 or inputs[0].type != "tensor(float)":
@@ -175,7 +174,7 @@ class Network:
         )
         remedy = "export it again" if self._carries_contract else f"correct the parameters {parameters}"
         return NetworkError(
-            f"{self._path}: is not a segmentation network of this contract: expected input tensor(float) "
+            f"{self.path}: is not a segmentation network of this contract: expected input tensor(float) "
             f"[n, {size}] and output of the channels {holds} in the image's shape; found {found or has}; "
             f"{remedy}, or give another file"
         )
@@ -193,7 +192,7 @@ class Network:
             right = "probability" if probable else "logits"
             remedy = "export it again" if self._carries_contract else f"set the parameter output to {right}"
             raise NetworkError(
-                f"{self._path}: output from {scores.min():.3g} to {scores.max():.3g} is not "
+                f"{self.path}: output from {scores.min():.3g} to {scores.max():.3g} is not "
                 f"{self.contract.output}; {remedy}"
             )
 
@@ -269,13 +268,13 @@ class Network:
             values = np.asarray(output, dtype=np.float32)
         except Exception as error:  # onnxruntime has no base class for its errors
             raise NetworkError(
-                f"{self._path}: does not run on {width}x{height} pixels ({_line(error)}); "
+                f"{self.path}: does not run on {width}x{height} pixels ({_line(error)}); "
                 + ("export it again" if self._carries_contract else
                    "correct the parameters layout and input_multiple")
             ) from error  # fmt: skip
         scores = self._planes(values, (height, width))
         if not np.isfinite(scores).all():
-            raise NetworkError(f"{self._path}: output is not finite; correct the parameters mean and std")
+            raise NetworkError(f"{self.path}: output is not finite; correct the parameters mean and std")
         return scores
 
     def _planes(self, output: FloatImage, size: tuple[int, int]) -> FloatImage:
@@ -292,6 +291,13 @@ class Network:
         if max(strides) > min(MAX_STRIDE, 1.1 * min(strides)):
             raise self._wrong("layout", f"an output {list(output.shape)} for {size[1]}x{size[0]} pixels")
         return values
+
+
+def _path(model: str) -> Path:
+    """The file of the parameter model."""
+    if model not in SHIPPED:
+        return Path(model)
+    return Path(str(importlib.resources.files("buildloc_segmenter").joinpath(SHIPPED[model])))
 
 
 def _load(path: Path, config: SegmenterConfig) -> onnxruntime.InferenceSession:

@@ -62,6 +62,12 @@ def test_a_core_that_is_a_speck_splits_nothing() -> None:
     assert len(found(scores((10, 10, 60, 50)), core)) == 1
 
 
+def test_what_is_finer_than_the_inset_of_a_core_splits_nothing() -> None:
+    core = scores((10, 10, 110, 70), inset=3)
+    core[:, 60:62] = -1.0  # a ridge of 0.4 m that the network is unsure of
+    assert len(found(scores((10, 10, 110, 70)), core)) == 1
+
+
 @pytest.mark.parametrize(("zoom", "gap_m"), [(2.0, 0.4), (1.0, 0.4), (0.4, 0.75)])
 def test_the_mask_keeps_touching_buildings_apart_at_any_size(zoom: float, gap_m: float) -> None:
     pixel_m = GSD_M / zoom

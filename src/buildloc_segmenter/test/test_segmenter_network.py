@@ -179,13 +179,25 @@ def test_probability_is_not_taken_for_logits_nor_the_reverse(tmp_path: Path) -> 
     with pytest.raises(NetworkError, match="set the parameter output to probability"):
         Network(replace(PLAIN, model=sigmoid))
     with pytest.raises(NetworkError, match="set the parameter output to logits"):
-        Network(SegmenterConfig(output="probability"))
+        Network(
+            replace(
+                PLAIN,
+                model=save_graph(tmp_path / "logits.onnx", RED_MINUS_GREEN, [0.0]),
+                output="probability",
+            )
+        )
 
 
 def test_what_fails_in_the_network_is_one_line(tmp_path: Path) -> None:
-    # The shipped network needs multiples of 32.
+    # The shipped network, without its contract, still needs multiples of 32.
+    stripped = onnx.load(str(Network(SegmenterConfig()).path))
+    del stripped.metadata_props[:]
+    onnx.save(stripped, str(tmp_path / "stripped.onnx"))
+    config = SegmenterConfig(
+        model=str(tmp_path / "stripped.onnx"), channels=("building", "core"), input_multiple=16
+    )
     with pytest.raises(NetworkError, match="does not run on 272x272 pixels") as caught:
-        Network(SegmenterConfig(input_multiple=16))
+        Network(config)
     assert "\n" not in str(caught.value)
     model = save_graph(tmp_path / "nan.onnx", np.full(3, np.nan), [0.0])
     with pytest.raises(NetworkError, match="not finite"):
