@@ -23,9 +23,8 @@ from buildloc_eval.mapper_process import Load, map_all
 from buildloc_eval.orthos import LabelledGround
 from buildloc_eval.world import MirroredWorld
 
-MIRRORED = 2  # the picture, times two each way
 FLIGHT = FlightConfig(
-    leg_m=2300.0, spacing_m=80.0, speed_mps=5.0, altitude_swing_m=10.5, tilt_deg=3.0, length_m=1e5
+    leg_m=1150.0, spacing_m=55.0, speed_mps=5.0, altitude_swing_m=10.5, tilt_deg=3.0, length_m=1e5
 )
 METRES_PER_KEYFRAME = 25.0
 ENDS = 100  # keyframes at either end that are compared
@@ -34,8 +33,8 @@ DEADLINE_S = 300.0
 
 
 def long_flight(ground: LabelledGround, keyframes: int, seed: int) -> CutFlight:
-    """Back and forth over an orthophoto and its mirror images."""
-    worlds = (MirroredWorld(world, MIRRORED) for world in (ground.picture, ground.labels))
+    """Back and forth over an orthophoto and its mirror image below it."""
+    worlds = (MirroredWorld(world, down=2, across=1) for world in (ground.picture, ground.labels))
     picture, labels = worlds
     config = replace(FLIGHT, length_m=keyframes * METRES_PER_KEYFRAME)
     flight = cut("endurance", picture, labels, fly(picture.bounds_m, config, seed), config, seed)

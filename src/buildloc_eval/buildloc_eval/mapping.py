@@ -55,7 +55,7 @@ IMAGERY = {
     "barnarp, banepa_ortho, altitude_bias, endurance": (
         "real orthophotos, photographed along simulated paths through a simulated camera; masks are the true "
         "outlines seen by that camera, so that mapping is measured alone; banepa_ortho is labelled in its "
-        "middle only; endurance flies over barnarp and its mirror images"
+        "middle only; endurance flies over barnarp and its mirror image"
     ),
 }
 

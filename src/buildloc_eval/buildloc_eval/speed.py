@@ -20,8 +20,11 @@ from buildloc_segmenter.config import SegmenterConfig
 from buildloc_segmenter.instances import draw_mask, find_instances
 from buildloc_segmenter.network import Network
 
+from buildloc_eval.flight import FlightConfig, focal_px
+
 SIZE = (1280, 720)
-GSD_M = 0.13  # of a frame from 105 m
+CAMERA = FlightConfig()  # 105 m above ground
+GSD_M = CAMERA.altitude_m / focal_px(CAMERA)
 ORTHO_GSD_M = 0.16
 FRAMES = 15
 STAGES = ("decode", "resize and infer", "instances", "mask")
@@ -63,7 +66,7 @@ def speed(jpeg: bytes, models: Sequence[str], config: SegmenterConfig) -> dict[s
                 runs[name].append(found)
     report: dict[str, Any] = {
         "load average": os.getloadavg()[0],
-        "frame": f"{SIZE[0]}x{SIZE[1]} at {GSD_M} m",
+        "frame": f"{SIZE[0]}x{SIZE[1]} at {GSD_M:.3f} m",
     }
     first = 0.0
     for name, model in zip(networks, models, strict=True):

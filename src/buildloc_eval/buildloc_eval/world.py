@@ -111,17 +111,19 @@ class PictureWorld:
 
 
 class MirroredWorld(PictureWorld):
-    """A picture laid ``times`` side by side and one below the other, every second one mirrored: the ground
-    goes on over the seams, and of two times no two places look alike. The first is the picture itself."""
+    """A picture laid ``down`` and ``across`` times, every second one mirrored: the ground goes on over the
+    seams. The first is the picture itself. Twice in one direction, no two places look alike but for a mirror;
+    twice in both, every place has its like, turned by half a circle."""
 
-    def __init__(self, picture: PictureWorld, times: int) -> None:
+    def __init__(self, picture: PictureWorld, down: int, across: int) -> None:
         super().__init__(picture._image, picture.epsg, picture._left_m, picture._top_m, picture._gsd_m)
-        self._times = times
+        self._times = np.array([down, across])
 
     @property
     def _shape(self) -> tuple[int, int]:
         height, width = super()._shape
-        return self._times * height, self._times * width
+        down, across = self._times
+        return int(down) * height, int(across) * width
 
     def _part(self, r0: int, r1: int, c0: int, c1: int) -> ByteArray:
         height, width = super()._shape

@@ -28,4 +28,6 @@ def ground_texture(data: Path, flight: PaperFlight, rng: np.random.Generator) ->
     whole = picture.window(picture.bounds_m)
     size = whole.gsd_m * np.array(whole.image_bgr.shape[1::-1])
     left, top = flight.centre_m + size * (-1.0, 0.5) + rng.uniform(-1.0, 1.0, 2) * SHIFT_M
-    return MirroredWorld(PictureWorld(whole.image_bgr, EPSG, float(left), float(top), whole.gsd_m), TIMES)
+    return MirroredWorld(
+        PictureWorld(whole.image_bgr, EPSG, float(left), float(top), whole.gsd_m), TIMES, TIMES
+    )
