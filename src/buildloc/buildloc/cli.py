@@ -283,6 +283,9 @@ def _map(args: argparse.Namespace) -> int:
     segmenter = Segmenter(config_of(settings, SEGMENTER, SegmenterConfig))
     mapper = Mapper(config_of(settings, MAPPER, MapperConfig))
     update, picture, refused = None, None, list[str]()
+    for path in (args.out, args.trajectory, args.plot):
+        if isinstance(path, Path):  # before the work, not after it
+            path.parent.mkdir(parents=True, exist_ok=True)
     if args.plot is not None:
         from buildloc.map_picture import MapPicture  # matplotlib is loaded for pictures alone
 
