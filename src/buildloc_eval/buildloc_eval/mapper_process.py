@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from multiprocessing.queues import Queue
-from pathlib import Path
 
 from buildloc_mapper.config import MapperConfig
 from buildloc_mapper.mapper import Mapper, MapUpdate
 from buildloc_msgs_py.types import Frame, Mask
+
+from buildloc_eval.process_memory import memory_mb
 
 
 @dataclass(frozen=True)
@@ -33,11 +34,6 @@ def map_all(config: MapperConfig, shots: Queue[tuple[Frame, Mask] | None], answe
         mapper.add(*shot)
         wall.append(time.perf_counter() - started)
         processor.append(time.process_time() - worked)
-        resident.append(_memory_mb("VmRSS"))
-    peak = _memory_mb("VmHWM")
+        resident.append(memory_mb("VmRSS"))
+    peak = memory_mb("VmHWM")
     answer.put(Load(tuple(wall), tuple(processor), tuple(resident), peak, mapper.finish()))
-
-
-def _memory_mb(what: str) -> float:
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return float(next(line for line in lines if line.startswith(what)).split()[1]) / 1024.0

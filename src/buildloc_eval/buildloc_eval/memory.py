@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
-from multiprocessing.queues import Queue
 from pathlib import Path
 
 from buildloc_matcher.config import matcher_config
@@ -11,7 +9,7 @@ from buildloc_matcher.matcher import Matcher
 from buildloc_matcher.reference.database import open_database
 from buildloc_msgs_py.types import LocalMap
 
-DEADLINE_S = 300.0
+from buildloc_eval.process_memory import peak_mb
 
 
 def peak_memory_mb(database: Path, local_map: LocalMap) -> float:
@@ -19,20 +17,11 @@ def peak_memory_mb(database: Path, local_map: LocalMap) -> float:
 
     Libraries and the part of the mapped tables that was read are in it.
     """
-    context = multiprocessing.get_context("spawn")
-    answer: Queue[float] = context.Queue()
-    process = context.Process(target=_locate, args=(database, local_map, answer))
-    process.start()
-    peak = answer.get(timeout=DEADLINE_S)
-    process.join()
-    return peak
+    return peak_mb(_locate, database, local_map)
 
 
-def _locate(database: Path, local_map: LocalMap, answer: Queue[float]) -> None:
+def _locate(database: Path, local_map: LocalMap) -> None:
     config = matcher_config()
     matcher = Matcher(open_database(database, config), config)
     for _ in range(2):
         matcher.locate(local_map)
-    status = Path("/proc/self/status").read_text().splitlines()
-    peak = next(line for line in status if line.startswith("VmHWM"))
-    answer.put(float(peak.split()[1]) / 1024.0)

@@ -15,6 +15,7 @@ import cv2
 import geopandas as gpd
 import numpy as np
 import shapely
+from buildloc.images import SUFFIXES
 from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.types import ByteArray
 from numpy.typing import NDArray
@@ -23,7 +24,6 @@ from pyproj import CRS
 Labels = NDArray[np.int32]
 BoolArray = NDArray[np.bool_]
 EQUATOR_M = 2.0 * math.pi * 6378137.0
-IMAGES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 INRIA_GSD_M = 0.3
 FINER = 5
 SPECK_PX = 10  # mask components smaller than this are rasterisation crumbs, no buildings
@@ -84,11 +84,11 @@ def components(mask: ByteArray) -> Labels:
 
 def _pairs(images: Path, masks: Path) -> list[tuple[Path, Path]]:
     """Images and masks of the same stem. Raises PlaceError when there are none."""
-    by_stem = {path.stem: path for path in images.glob("*") if path.suffix.lower() in IMAGES}
+    by_stem = {path.stem: path for path in images.glob("*") if path.suffix.lower() in SUFFIXES}
     pairs = [
         (by_stem[mask.stem], mask)
         for mask in sorted(masks.glob("*"))
-        if mask.suffix.lower() in IMAGES and mask.stem in by_stem
+        if mask.suffix.lower() in SUFFIXES and mask.stem in by_stem
     ]
     if not pairs:
         raise PlaceError(

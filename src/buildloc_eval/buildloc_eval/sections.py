@@ -14,16 +14,23 @@ Scores = dict[str, Any]
 PICTURES = "pictures"  # of the scores: (caption, file in the folder) of each
 
 
-def fingerprint(packages: Iterable[str], *settings: Any) -> str:
-    """Changes when a source file of these packages does, or a setting."""
-    digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode())
-    for name in sorted(packages):
+def source_digest(names: Iterable[str]) -> str:
+    """Changes when the source of a module does, or of any module of a package among them."""
+    digest = hashlib.sha256()
+    for name in sorted(names):
         found = importlib.util.find_spec(name)
-        if found is None or not found.submodule_search_locations:
+        if found is None or found.origin is None:
             raise ModuleNotFoundError(name)
-        for path in sorted(Path(found.submodule_search_locations[0]).rglob("*.py")):
+        file = Path(found.origin)
+        for path in sorted(file.parent.rglob("*.py")) if found.submodule_search_locations else [file]:
             digest.update(path.name.encode() + path.read_bytes())
     return digest.hexdigest()
+
+
+def fingerprint(packages: Iterable[str], *settings: Any) -> str:
+    """Changes when a source file of these packages does, or a setting."""
+    told = json.dumps(settings, sort_keys=True, default=str) + source_digest(packages)
+    return hashlib.sha256(told.encode()).hexdigest()
 
 
 class Sections:

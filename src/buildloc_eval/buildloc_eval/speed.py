@@ -5,12 +5,10 @@ A module of its own, for the process whose memory is measured to load nothing el
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from multiprocessing.queues import Queue
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +19,7 @@ from buildloc_segmenter.instances import draw_mask, find_instances
 from buildloc_segmenter.network import Network
 
 from buildloc_eval.flight import FlightConfig, focal_px
+from buildloc_eval.process_memory import peak_mb
 
 SIZE = (1280, 720)
 CAMERA = FlightConfig()  # 105 m above ground
@@ -28,7 +27,6 @@ GSD_M = CAMERA.altitude_m / focal_px(CAMERA)
 ORTHO_GSD_M = 0.16
 FRAMES = 15
 STAGES = ("decode", "resize and infer", "instances", "mask")
-DEADLINE_S = 600.0
 
 
 def frame_jpeg(imagery: Path) -> bytes:
@@ -73,7 +71,7 @@ def speed(jpeg: bytes, models: Sequence[str], config: SegmenterConfig) -> dict[s
         median = {stage: float(np.median([run[stage] for run in runs[name]])) for stage in runs[name][0]}
         whole = float(np.median([sum(run.values()) for run in runs[name]]))
         first = first or whole
-        memory = peak_memory_mb(replace(config, model=model), jpeg)
+        memory = peak_mb(_segment, replace(config, model=model), jpeg)
         report[name] = {
             "ms": median, "ms_total": whole, "times the first": whole / first, "peak_memory_mb": memory
         }  # fmt: skip
@@ -91,21 +89,8 @@ def speed_table(report: dict[str, Any]) -> list[str]:
     ]
 
 
-def peak_memory_mb(config: SegmenterConfig, jpeg: bytes) -> float:
-    """Peak resident memory, MB, of a process that segments a frame twice; libraries are in it."""
-    context = multiprocessing.get_context("spawn")
-    answer: Queue[float] = context.Queue()
-    process = context.Process(target=_segment, args=(config, jpeg, answer))
-    process.start()
-    peak = answer.get(timeout=DEADLINE_S)
-    process.join()
-    return peak
-
-
-def _segment(config: SegmenterConfig, jpeg: bytes, answer: Queue[float]) -> None:
+def _segment(config: SegmenterConfig, jpeg: bytes) -> None:
+    """What the process does whose memory is measured."""
     network = Network(config)
     for _ in range(2):
         stages(network, config, jpeg)
-    status = Path("/proc/self/status").read_text().splitlines()
-    peak = next(line for line in status if line.startswith("VmHWM"))
-    answer.put(float(peak.split()[1]) / 1024.0)

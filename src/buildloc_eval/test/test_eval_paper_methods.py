@@ -29,7 +29,8 @@ from buildloc_eval.paper.scoring import (
     recall_row,
     score,
 )
-from buildloc_eval.paper.store import StaleError, Store, code_hash
+from buildloc_eval.paper.store import StaleError, Store
+from buildloc_eval.sections import source_digest
 from buildloc_eval.segmentation_errors import SegmentationErrors
 from buildloc_matcher.reference.buildings import Buildings
 from buildloc_msgs_py.footprint import footprints
@@ -269,10 +270,10 @@ def test_results_of_another_configuration_or_code_are_refused(tmp_path: Path) ->
 def test_the_code_hash_follows_the_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "some_code.py").write_text("A = 1\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    before = code_hash(["some_code"])
-    assert before == code_hash(["some_code"])
+    before = source_digest(["some_code"])
+    assert before == source_digest(["some_code"])
     (tmp_path / "some_code.py").write_text("A = 2\n")
-    assert code_hash(["some_code"]) != before
+    assert source_digest(["some_code"]) != before
 
 
 def test_a_run_is_predicted_scored_and_reported_and_goes_on_where_it_was(

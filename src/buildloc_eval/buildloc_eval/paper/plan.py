@@ -16,7 +16,8 @@ from buildloc_eval.observation import Digitiser
 from buildloc_eval.paper.differences import AutomaticMapping
 from buildloc_eval.paper.flights import PaperFlight
 from buildloc_eval.paper.published import LARGE_RADII_KM, RADII_KM
-from buildloc_eval.paper.store import Store, code_hash
+from buildloc_eval.paper.store import Store
+from buildloc_eval.sections import source_digest
 from buildloc_eval.segmentation_errors import Outlines, SegmentationErrors, read_errors
 
 PAPER = "buildloc_eval.paper"
@@ -93,11 +94,11 @@ class Stores:
         ground = {"seed": seed, "digitiser": said.pop("digitiser"), "automatic": said.pop("automatic")}
         track = {"seed": seed, "mapper": asdict(models.mapper)}
         matchers = {name: asdict(matcher_config({"preset": name})) for name in ("default", "paper")}
-        self.ground = Store(out / "ground", _plain(ground | {"code": code_hash(GROUND_CODE)}))
-        self.tracks = Store(out / "tracks", _plain(track | {"code": code_hash(TRACK_CODE)}))
+        self.ground = Store(out / "ground", _plain(ground | {"code": source_digest(GROUND_CODE)}))
+        self.tracks = Store(out / "tracks", _plain(track | {"code": source_digest(TRACK_CODE)}))
         maps = ground | track | said
-        self.maps = Store(out / "maps", _plain(maps | {"code": code_hash(MAP_CODE)}))
-        predictions = maps | {"matchers": matchers, "code": code_hash(PREDICTION_CODE)}
+        self.maps = Store(out / "maps", _plain(maps | {"code": source_digest(MAP_CODE)}))
+        predictions = maps | {"matchers": matchers, "code": source_digest(PREDICTION_CODE)}
         self.predictions = Store(out / "predictions", _plain(predictions))
 
 

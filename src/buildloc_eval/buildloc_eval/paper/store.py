@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
-import importlib
 import json
 import os
 import pickle
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +15,6 @@ MANIFEST = "made_by.json"
 
 class StaleError(BuildlocError):
     """Kept results are of another configuration or code."""
-
-
-def code_hash(modules: Sequence[str]) -> str:
-    """Of the source of modules, and of all the modules of the packages among them."""
-    digest = hashlib.sha256()
-    for name in sorted(modules):
-        file = Path(str(importlib.import_module(name).__file__))
-        for path in sorted(file.parent.rglob("*.py")) if file.name == "__init__.py" else [file]:
-            digest.update(path.name.encode() + path.read_bytes())
-    return digest.hexdigest()[:16]
 
 
 class Store:
