@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 from pathlib import Path
@@ -10,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import shapely
+from buildloc_eval.cli import add_eval_arguments, run_eval
 from buildloc_eval.flight import fly, margin_m
 from buildloc_eval.orthos import LabelledGround
 from buildloc_eval.paper import chapters, real, tokyo
@@ -26,6 +28,7 @@ from buildloc_eval.realworld import DataError, data_folder
 from buildloc_eval.segmentation import EvaluationError
 from buildloc_eval.segmentation_errors import SegmentationErrors
 from buildloc_eval.world import PictureWorld
+from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.types import Keyframe, LocalMap
 from buildloc_segmenter.config import SegmenterConfig
 from buildloc_segmenter.network import Network
@@ -235,6 +238,17 @@ def test_the_report_tells_what_is_real_what_was_left_out_and_what_lost_each_flig
     assert held["Tokyo, buildings of the smallest reference"] is False
     assert held["real imagery, barnarp: default preset, recall@1 at 12 km"] is False
     assert "banepa was left out" in text and "banepa was left out" in (tmp_path / "report.html").read_text()
+
+
+def test_parts_and_networks_are_of_this_evaluation_alone() -> None:
+    parser = argparse.ArgumentParser()
+    add_eval_arguments(parser)
+    given = parser.parse_args(["paper", "--out", "x", "--parts", "tokyo", "real", "--model", "banepa=a.onnx"])
+    assert (given.parts, given.models) == (["tokyo", "real"], ["banepa=a.onnx"])
+    with pytest.raises(BuildlocError, match="of `eval paper`, not of `eval scale`"):
+        run_eval(parser.parse_args(["scale", "--out", "x", "--parts", "tokyo"]))
+    with pytest.raises(BuildlocError, match="--model banepa: expected PLACE=MODEL"):
+        run_eval(parser.parse_args(["paper", "--out", "x", "--model", "banepa"]))
 
 
 @pytest.mark.data
