@@ -247,6 +247,8 @@ def test_parts_and_networks_are_of_this_evaluation_alone() -> None:
     assert (given.parts, given.models) == (["tokyo", "real"], ["banepa=a.onnx"])
     with pytest.raises(BuildlocError, match="of `eval paper`, not of `eval scale`"):
         run_eval(parser.parse_args(["scale", "--out", "x", "--parts", "tokyo"]))
+    with pytest.raises(BuildlocError, match="--model is of the part real"):
+        run_eval(parser.parse_args(["paper", "--out", "x", "--parts", "tokyo", "--model", "banepa=a.onnx"]))
     with pytest.raises(BuildlocError, match="--model banepa: expected PLACE=MODEL"):
         run_eval(parser.parse_args(["paper", "--out", "x", "--model", "banepa"]))
 
