@@ -111,7 +111,7 @@ def run_trial(matcher: Matcher, observed: ObservedMap) -> Trial:
         math.hypot(c.x_m - observed.centre_m[0], c.y_m - observed.centre_m[1]) for c in found.candidates
     ]
     ranks = [rank for rank, error in enumerate(errors, start=1) if error <= CORRECT_M]
-    accepted = matcher.refuse(found) is None
+    accepted = matcher.judge(found).reason is None
     return Trial(ranks[0] if ranks else 0, errors[0] if errors else math.inf, accepted, found.seconds)
 
 
@@ -250,7 +250,7 @@ def controls(
             for i in range(plan.maps):
                 rng = np.random.default_rng([seed + i, count, level])
                 found = matcher.locate(observe_map(away, tree, count, sensing(level), rng).local_map)
-                tried, false = tried + 1, false + (matcher.refuse(found) is None)
+                tried, false = tried + 1, false + (matcher.judge(found).reason is None)
     return {"maps": tried, "false fixes": false, "reference": len(reference)}
 
 

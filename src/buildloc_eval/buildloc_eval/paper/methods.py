@@ -109,7 +109,7 @@ def locate(matcher: Matcher, maps: Maps, keyframes: int, final: bool) -> Predict
         refined = _refined(matcher, found, maps, snapshot, keyframes)
         seconds["refine"] = time.perf_counter() - started
     return Prediction(
-        kept[:, :2], kept[:, 2:], centre, bins, refined, matcher.refuse(found), seconds, found.funnel
+        kept[:, :2], kept[:, 2:], centre, bins, refined, matcher.judge(found).reason, seconds, found.funnel
     )  # fmt: skip
 
 
