@@ -29,7 +29,7 @@ TRACK_CODE = (
 )  # fmt: skip
 MAP_CODE = (*TRACK_CODE, *GROUND_CODE, f"{PAPER}.brm", "buildloc_eval.segmentation_errors")
 PREDICTION_CODE = (
-    *MAP_CODE, "buildloc_matcher", "buildloc_eval.generators", "buildloc_eval.scale", f"{PAPER}.methods"
+    *MAP_CODE, "buildloc_matcher", "buildloc_eval.generators", f"{PAPER}.methods"
 )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -40,14 +40,19 @@ def score(found: Prediction, maps: Maps, keyframes: int, radius_km: float) -> Sc
     snapshot, truth = maps.snapshots[keyframes - 1], last
     if found.centre_m is not None and snapshot is not None:
         truth = true_place(maps, snapshot, found.centre_m)
-    errors = np.hypot(*(found.places_m - truth).T)
+    final = math.inf if found.final_m is None else float(np.hypot(*(found.final_m - last)))
+    return replace(placed(found, truth, radius_km), final_m=final)
+
+
+def placed(found: Prediction, truth_m: FloatArray, radius_km: float) -> Score:
+    """Compare the places of a prediction with the true one (2,); nothing of a refined place."""
+    errors = np.hypot(*(found.places_m - truth_m).T)
     right = np.flatnonzero(errors <= CORRECT_M)
     rank = int(right[0]) + 1 if len(right) else 0
-    final = math.inf if found.final_m is None else float(np.hypot(*(found.final_m - last)))
-    bin_rank = rank_of_bin(found, truth, radius_km)
+    bin_rank = rank_of_bin(found, truth_m, radius_km)
     lost = "" if rank == 1 else lost_by(found, rank, bin_rank, radius_km)
     coarse = float(errors[0]) if len(errors) else math.inf
-    return Score(rank, coarse, final, bin_rank, found.refused is None, lost)
+    return Score(rank, coarse, math.inf, bin_rank, found.refused is None, lost)
 
 
 def bins_within(radius_km: float) -> int:
