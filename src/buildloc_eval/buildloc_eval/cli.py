@@ -165,6 +165,17 @@ def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
         "--levels", nargs="+", type=_level, metavar="LEVEL",
         help="levels of the maps' errors: numbers, or `measured` on the segmenter (default: 1 2 3)",
     )  # fmt: skip
+    paper = parser.add_argument_group("eval paper")
+    paper.add_argument(
+        "--parts",
+        nargs="+",
+        choices=["boston", "tokyo", "real"],
+        help="parts to run and report (default: all)",
+    )
+    paper.add_argument(
+        "--model", action="append", default=[], metavar="PLACE=MODEL", dest="models",
+        help="ONNX network for real imagery of a place that it never saw; repeatable (default: shipped one)",
+    )  # fmt: skip
     group = parser.add_argument_group("eval segmentation")
     group.add_argument(
         "--case", action="append", default=[], metavar="PLACE=MODEL", dest="cases",
@@ -196,6 +207,8 @@ def run_eval(args: argparse.Namespace) -> int:
         )
     if args.name != "scale" and args.levels:
         raise BuildlocError(f"--levels is of `eval scale`, not of `eval {args.name}`")
+    if args.name != "paper" and (args.parts or args.models):
+        raise BuildlocError(f"--parts and --model are of `eval paper`, not of `eval {args.name}`")
     if args.name == "scale":
         from buildloc_eval import scale
 
@@ -211,8 +224,11 @@ def run_eval(args: argparse.Namespace) -> int:
         print(mapping.evaluate(args.out, args.seed, args.quick, _stage))
     elif args.name == "paper":
         from buildloc_eval.paper import evaluate as paper
+        from buildloc_eval.segmentation import parse_case
 
-        print(paper.evaluate(args.out, args.seed, args.quick, _stage))
+        given = {case.place: case.model for case in (parse_case(text, "--model") for text in args.models)}
+        parts = args.parts or paper.PARTS
+        print(paper.evaluate(args.out, args.seed, args.quick, _stage, parts, given))
     elif args.name == "segmentation":
         from buildloc_eval import segmentation
 

@@ -13,6 +13,8 @@ STYLE = (
     "td,th{border:1px solid #ccc;padding:.2em .6em;text-align:left;vertical-align:top}img{max-width:100%}"
 )
 
+Pictures = Sequence[tuple[str, Path]]
+
 
 def _cell(value: Any) -> str:
     if isinstance(value, dict):
@@ -39,15 +41,25 @@ def _rows(rows: list[dict[str, Any]]) -> str:
     return f"<table><tr>{head}</tr>{body}</table>"
 
 
-def write_report(
-    path: Path, title: str, report: dict[str, Any], pictures: Sequence[tuple[str, Path]]
-) -> None:
-    """Write one HTML file that needs no other."""
-    figures = "".join(
+def _figures(pictures: Pictures) -> str:
+    return "".join(
         f"<h2>{html.escape(caption)}</h2>"
         f'<img alt="{html.escape(caption)}" src="data:image/png;base64,'
         f'{base64.b64encode(picture.read_bytes()).decode()}">'
         for caption, picture in pictures
+    )
+
+
+def write_report(
+    path: Path,
+    title: str,
+    report: dict[str, Any],
+    pictures: Pictures,
+    chapters: Sequence[tuple[str, dict[str, Any], Pictures]] = (),
+) -> None:
+    """Write one HTML file that needs no other; chapters follow, each with its title, figures and pictures."""
+    figures = _figures(pictures) + "".join(
+        f"<h1>{html.escape(name)}</h1>{_table(values)}{_figures(own)}" for name, values, own in chapters
     )
     heading = html.escape(title)
     path.write_text(

@@ -30,7 +30,7 @@ SHOWN = 3
 class Trace:
     """Rank of the true bin after 1, 2, ... keyframes of a flight, and where it is stably the first."""
 
-    flight: int
+    flight: str
     ranks: Sequence[int]
     stable: int | None
 
@@ -50,16 +50,16 @@ def _ground(axes: Axes, outlines: Outlines, centre_m: FloatArray, half_m: float)
 
 
 def draw_trajectories(
-    path: Path, reference: Mapping[int, Outlines], paths_m: Mapping[int, FloatArray]
+    path: Path, reference: Mapping[str, Outlines], paths_m: Mapping[str, FloatArray]
 ) -> Path:
     """Every flight's true path over the reference around it."""
     figure, panels = plt.subplots(1, len(paths_m), figsize=(3.2 * len(paths_m), 3.5), squeeze=False)
-    for axes, (number, flown) in zip(panels[0], paths_m.items(), strict=True):
+    for axes, (name, flown) in zip(panels[0], paths_m.items(), strict=True):
         centre = 0.5 * (flown.min(axis=0) + flown.max(axis=0))
-        _ground(axes, reference[number], centre, VIEW_M)
+        _ground(axes, reference[name], centre, VIEW_M)
         axes.plot(*(flown - centre).T, "tab:blue", lw=1.5)
         axes.plot(*(flown[0] - centre), "o", color="tab:green")
-        axes.set_title(f"flight {number}")
+        axes.set_title(name)
     return _save(figure, path)
 
 
@@ -68,7 +68,7 @@ def draw_convergence(path: Path, traces: Sequence[Trace], radius_km: int, bins: 
     figure, axes = plt.subplots(figsize=(9, 4.8))
     for trace in traces:
         keyframes = np.arange(1, len(trace.ranks) + 1)
-        (line,) = axes.plot(keyframes, trace.ranks, lw=1.2, label=f"flight {trace.flight}")
+        (line,) = axes.plot(keyframes, trace.ranks, lw=1.2, label=trace.flight)
         if trace.stable is not None:
             axes.plot(trace.stable, 1, "*", ms=13, color=line.get_color())
     axes.set(

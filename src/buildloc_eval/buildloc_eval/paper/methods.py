@@ -29,6 +29,7 @@ STARS = {
     "without shape": "shape-free 8-D",
 }
 BRM = "BRM"
+METHODS = (BRM, *reversed(STARS))
 # What stands in the paper's table where these stand in ours.
 PUBLISHED = {
     "default preset": "ours",
@@ -63,10 +64,12 @@ def nothing(reason: str) -> Prediction:
     return Prediction(none, none, None, none.astype(np.int32), None, reason, {}, {})
 
 
-def reference_within(buildings: Buildings, centre_m: FloatArray, radius_km: float) -> ReferenceDatabase:
+def reference_within(
+    buildings: Buildings, centre_m: FloatArray, radius_km: float, epsg: int = EPSG
+) -> ReferenceDatabase:
     """The database of a search radius, in memory."""
     inside = np.hypot(*(buildings.centroids_m - centre_m).T) <= 1000.0 * radius_km
-    return assemble(EPSG, buildings.select(inside), matcher_config())
+    return assemble(epsg, buildings.select(inside), matcher_config())
 
 
 def make_matcher(name: str, database: ReferenceDatabase) -> Matcher:
