@@ -17,7 +17,6 @@ from buildloc_matcher.config import matcher_config
 from buildloc_matcher.matcher import Matcher
 from buildloc_matcher.reference.buildings import Buildings
 from buildloc_matcher.reference.database import ReferenceDatabase, assemble
-from buildloc_msgs_py.footprint import footprints
 from buildloc_msgs_py.types import FloatArray
 from scipy.spatial import cKDTree
 
@@ -32,9 +31,9 @@ from buildloc_eval.beyond.cases import (
 )
 from buildloc_eval.beyond.report import Ablations, Curves, write
 from buildloc_eval.observation import Digitiser, ObservedMap, observe_map, sensing
-from buildloc_eval.paper.evaluate import side_by_side
 from buildloc_eval.paper.flights import EPSG
-from buildloc_eval.paper.sources import read_boston
+from buildloc_eval.paper.sources import measure, read_boston
+from buildloc_eval.paper.stages import side_by_side
 from buildloc_eval.paper.store import Store
 from buildloc_eval.realworld import LEXINGTON_DEG
 from buildloc_eval.sections import source_digest
@@ -167,9 +166,7 @@ def evaluate(out: Path, seed: int, quick: bool, say: Say) -> str:
     ground, trials = stores(out, seed, plan.maps)
     if not ground.has(BUILDINGS):
         say("reading the footprints of greater Boston")
-        found = footprints(read_boston())
-        areas, shapes = found.areas_m2.astype(np.float32), found.shapes.astype(np.float32)
-        ground.save(BUILDINGS, Buildings(found.centroids_m, areas, shapes))
+        ground.save(BUILDINGS, measure(read_boston()))
     asked, file = cases(plan), ground.path(BUILDINGS)
     jobs = [(case.name, case.cost, partial(run_case, file, case, plan.maps, seed)) for case in asked]
     side_by_side(jobs, trials, "locating", say)

@@ -45,12 +45,10 @@ BAR = 0.9  # of recall at 1 in all of greater Boston, default preset, level 1
 def row(located: Sequence[Trial]) -> dict[str, Any]:
     """What a table tells of a case."""
     found = summary(located)
-    told: dict[str, Any] = {"maps": found["maps"]}
-    for k in RANKS:
-        low, high = found[f"recall@{k}_95%"]
-        told |= {f"recall@{k}": found[f"recall@{k}"], f"recall@{k}, 95 %": f"{low:.3f} to {high:.3f}"}
-    told |= {key: found[key] for key in ("median_error_m", "fixes", "false_fixes", "ms_total")}
-    return told | {"lost by": "; ".join(f"{reason}: {n}" for reason, n in found["lost_by"].items())}
+    kept = [key for k in RANKS for key in (f"recall@{k}", f"recall@{k}_95%")]
+    told = {key: found[key] for key in ("maps", *kept, "median_error_m", "fixes", "false_fixes", "ms_total")}
+    lost = Counter(t.lost_by.split(":")[0] for t in located if t.lost_by)
+    return told | {"lost by": [f"{stage}: {count}" for stage, count in lost.most_common()]}
 
 
 def factor_table(by_preset: Mapping[str, Values], located: Located) -> list[dict[str, Any]]:

@@ -50,9 +50,9 @@ class Plan:
 
 FULL = Plan(
     tuple(f"flight{n}" for n in range(1, 8)), 10, RADII_KM,
-    {"default preset": LARGE_RADII_KM, "paper preset": (6,)}, 1
+    {"default preset": LARGE_RADII_KM, "paper preset": LARGE_RADII_KM}, 10
 )  # fmt: skip
-QUICK = Plan(("flight1", "flight2"), 2, (1, 6, 12), {"default preset": (6,)}, 1)
+QUICK = Plan(("flight1", "flight2"), 2, (1, 6, 12), {"default preset": (6,), "paper preset": (6,)}, 2)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from buildloc_msgs_py.types import FloatArray
 from scipy.stats import binomtest
+from scipy.stats import t as student
 
 from buildloc_eval.paper.flown import Maps, true_place
 from buildloc_eval.paper.methods import Prediction
@@ -92,6 +93,17 @@ def interval(successes: int, trials: int) -> tuple[float, float]:
     """95 % interval of a share, Wilson's."""
     found = binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
     return round(float(found.low), 4), round(float(found.high), 4)
+
+
+def mean_interval(values: Sequence[float]) -> list[float] | None:
+    """95 % interval of a mean, Student's; None for fewer than two values."""
+    if len(values) < 2:
+        return None
+    half = float(
+        student.ppf(0.5 + 0.5 * CONFIDENCE, len(values) - 1) * np.std(values, ddof=1) / math.sqrt(len(values))
+    )
+    mean = float(np.mean(values))
+    return [round(mean - half, 2), round(mean + half, 2)]
 
 
 def recall_row(scores: Sequence[Score]) -> dict[str, Any]:
