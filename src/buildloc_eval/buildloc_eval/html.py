@@ -23,11 +23,11 @@ def _cell(value: Any) -> str:
         return _table(value)
     if _is_rows(value):
         return _rows(value)
-    if isinstance(value, list | tuple):
+    if isinstance(value, list | tuple) and value:
         return ("<br>" if any(isinstance(one, str) for one in value) else ", ").join(map(_cell, value))
     if isinstance(value, float):
         return f"{value:.4g}"
-    return html.escape("none" if value is None else str(value))
+    return html.escape("none" if value is None or value == [] else str(value))
 
 
 def _is_rows(value: Any) -> bool:
