@@ -13,7 +13,7 @@ setup(
     maintainer_email="maintainers@buildloc.example",
     python_requires=">=3.11",
     packages=find_packages(include=[package, f"{package}.*"]),
-    package_data={package: ["py.typed"]},
+    package_data={package: ["py.typed", "calibration.json"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
         (f"share/{package}", ["package.xml"]),

@@ -20,7 +20,7 @@ def locate(matcher: Matcher, local_map: LocalMap, at_m: tuple[float, float] | No
     (2, 2) east, north in m2, score: log-odds in nats. ``candidates``: the same of the map's mean, ranked.
     """
     found = matcher.locate(local_map)
-    refused = matcher.refuse(found)
+    refused = matcher.judge(found).reason
     ranked = []
     for rank, candidate in enumerate(found.candidates[:top], start=1):
         latitude, longitude = matcher.database.to_wgs84(candidate.x_m, candidate.y_m)

@@ -197,7 +197,7 @@ def controls(
             for i in range(plan.maps):
                 rng = np.random.default_rng([seed + i, count, level])
                 found = matcher.locate(observe_map(away, tree, count, sensing(level), rng).local_map)
-                tried, false = tried + 1, false + (matcher.refuse(found) is None)
+                tried, false = tried + 1, false + (matcher.judge(found).reason is None)
     return {"maps": tried, "false fixes": false, "reference": len(reference)}
 
 

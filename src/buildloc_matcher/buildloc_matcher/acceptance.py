@@ -1,12 +1,22 @@
-"""The gate between a ranked candidate and a fix: every refusal says which figure fell short."""
+"""The gate between a ranked candidate and a fix: accepted, undecided or rejected, and which figure fell
+short.
+
+The score of the best candidate is the log-odds that the map lies there and neither at any of the other
+places that were found nor anywhere that chance could put it. How high it gets where the map lies nowhere
+near was measured (``calibration.json``); the threshold follows from the rate of false fixes asked for.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
 
+import numpy as np
 from buildloc_msgs_py.types import Candidate
 
+from buildloc_matcher.calibration import false_fix_probability, threshold
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.evidence import GATE_SIGMAS
 from buildloc_matcher.geometry import wrap
@@ -16,20 +26,47 @@ from buildloc_matcher.selection import Score
 ROTATIONS = 36
 
 
-def lead(best: Candidate, others: Sequence[Candidate], config: MatcherConfig) -> float:
-    """Evidence of the best candidate beyond that of the best other pose, nats; infinite without another.
+class Outcome(StrEnum):
+    """Accepted: a fix. Rejected: the reference shows no such place. Undecided: it may be there, or at
+    another place that looks alike, and more must be seen."""
 
-    Another pose is further away than ``rival_distance_m`` or turned by more than twice the rotation
-    tolerance: neighbours of the best bin are the same answer.
-    """
+    ACCEPTED = "accepted"
+    UNDECIDED = "undecided"
+    REJECTED = "rejected"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """An outcome, why it is no fix (None where it is one), the score in nats, and how often a map that lies
+    nowhere near scores as high."""
+
+    outcome: Outcome
+    reason: str | None
+    score: float
+    false_fix_probability: float
+
+
+def _elsewhere(best: Candidate, others: Sequence[Candidate], config: MatcherConfig) -> list[float]:
+    """Log-odds of other poses: further away than ``rival_distance_m`` or turned by more than twice the
+    rotation tolerance. Neighbours of the best bin are the same answer."""
     turned = math.radians(2.0 * config.rotation_tolerance_deg)
-    rivals = [
+    return [
         c.acceptance
         for c in others
         if math.hypot(c.x_m - best.x_m, c.y_m - best.y_m) > config.rival_distance_m
         or abs(float(wrap(c.yaw_rad - best.yaw_rad))) > turned
     ]
-    return best.acceptance - max(rivals, default=-math.inf)
+
+
+def lead(best: Candidate, others: Sequence[Candidate], config: MatcherConfig) -> float:
+    """Evidence of the best candidate beyond that of the best other pose, nats; infinite without another."""
+    return best.acceptance - max(_elsewhere(best, others, config), default=-math.inf)
+
+
+def odds_against_all(best: Candidate, others: Sequence[Candidate], config: MatcherConfig) -> float:
+    """Log-odds of the best candidate against everything else, nats: the other poses together, and chance,
+    whose evidence is 0 as log-odds."""
+    return best.acceptance - float(np.logaddexp.reduce([0.0, *_elsewhere(best, others, config)]))
 
 
 def log_odds(evidence: float, area_m2: float, config: MatcherConfig) -> float:
@@ -42,19 +79,39 @@ def log_odds(evidence: float, area_m2: float, config: MatcherConfig) -> float:
     return evidence - math.log(max(1.0, area_m2 / disc_m2) * ROTATIONS)
 
 
-def refuse_coarse(score: Score, lead_nats: float, odds: float, config: MatcherConfig) -> str | None:
-    """Why the best candidate is not convincing, or None; ``odds`` are its log-odds."""
-    if odds < config.min_log_odds:
-        return f"best candidate could be chance: log-odds {odds:.1f}, below {config.min_log_odds:g}"
-    if score.jaccard < config.min_jaccard:
-        return f"best candidate has MNN-Jaccard {score.jaccard:.2f}, below {config.min_jaccard:g}"
-    if lead_nats < config.min_lead:
-        return f"best candidate leads another place by {lead_nats:.1f} nats, below {config.min_lead:g}"
-    if len(score.pairs) < config.min_pairs:
-        return f"best candidate matches {len(score.pairs)} buildings, fewer than {config.min_pairs}"
-    if score.rms_m > config.max_residual_m:
-        return f"best candidate has residuals of {score.rms_m:.1f} m, above {config.max_residual_m:g} m"
-    return None
+def judge_candidate(
+    best: Candidate, others: Sequence[Candidate], found: Score, config: MatcherConfig
+) -> Verdict:
+    """Whether the best candidate is convincing. ``found`` is its score in the selection."""
+    nats, lead_nats = odds_against_all(best, others, config), lead(best, others, config)
+    chance, enough = false_fix_probability(nats), threshold(config.target_false_fix_rate)
+
+    def not_yet(outcome: Outcome, reason: str) -> Verdict:
+        return Verdict(outcome, f"{outcome}: {reason}", nats, chance)
+
+    if best.acceptance < 0.0:
+        return not_yet(
+            Outcome.REJECTED, f"best candidate is no more than chance: log-odds {best.acceptance:.1f}"
+        )
+    if nats < enough:
+        why = (
+            f"score {nats:.1f} nats, below the {enough:.1f} for {config.target_false_fix_rate:g} false fixes"
+        )
+        if lead_nats < best.acceptance:
+            return not_yet(
+                Outcome.UNDECIDED, f"best candidate leads another place by {lead_nats:.1f} nats: {why}"
+            )
+        return not_yet(Outcome.UNDECIDED, f"best candidate could be chance: {why}")
+    if found.jaccard < config.min_jaccard:
+        share = f"MNN-Jaccard {found.jaccard:.2f}, below {config.min_jaccard:g}"
+        return not_yet(Outcome.UNDECIDED, f"best candidate has {share}")
+    if len(found.pairs) < config.min_pairs:
+        count = f"{len(found.pairs)} buildings, fewer than {config.min_pairs}"
+        return not_yet(Outcome.UNDECIDED, f"best candidate matches {count}")
+    if found.rms_m > config.max_residual_m:
+        residuals = f"residuals of {found.rms_m:.1f} m, above {config.max_residual_m:g} m"
+        return not_yet(Outcome.UNDECIDED, f"best candidate has {residuals}")
+    return Verdict(Outcome.ACCEPTED, None, nats, chance)
 
 
 def refuse_refined(refined: Refined | None, config: MatcherConfig) -> str | None:

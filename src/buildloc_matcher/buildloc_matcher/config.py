@@ -47,6 +47,9 @@ class MatcherConfig:
     scale_gate: float = param(0.15, "largest deviation of the map-to-world scale from 1", 0.0, 0.9)
     sigma_m: float = param(2.0, "error of a map building against its neighbours, per axis, m", 0.1, 50.0)
     match_share: float = param(0.7, "share of the map's buildings that the reference has", 0.05, 0.99)
+    seen_share: float = param(
+        0.5, "share of the reference's observable buildings that the map has at least", 0.05, 0.95
+    )
     sigma_log_area: float = param(0.25, "error of the logarithm of a map building's area", 0.01, 5.0)
     area_share: float = param(0.8, "share of the matched buildings whose area is right up to that", 0.0, 0.99)
     sigma_scale: float = param(0.05, "error of the map's scale, from that of the altitude", 0.001, 1.0)
@@ -76,14 +79,8 @@ class MatcherConfig:
     refine_iterations: int = param(6, "refinement steps while the distance shrinks", 1, 100)
     min_buildings: int = param(12, "fewest buildings in the map for a fix", 3, 100000)
     min_jaccard: float = param(0.2, "smallest MNN-Jaccard of an accepted candidate", 0.0, 1.0)
-    min_log_odds: float = param(
-        30.0,
-        "smallest evidence of an accepted candidate beyond what chance gives in the reference, nats",
-        -300.0,
-        1e4,
-    )
-    min_lead: float = param(
-        30.0, "smallest lead in evidence over the best candidate elsewhere, nats", 0.0, 1e4
+    target_false_fix_rate: float = param(
+        1e-5, "how often a map that lies nowhere near may be accepted, at most", 1e-12, 0.5
     )
     rival_distance_m: float = param(15.0, "candidates further away than this are elsewhere, m", 0.0, 1e6)
     min_pairs: int = param(10, "fewest distinct reference buildings matched for a fix", 3, 100000)

@@ -34,6 +34,7 @@ NO_MATCH = -1
 FEWEST_AREAS = 4
 MAX_AREA_BIAS = 0.5
 MIN_AREA_SPREAD = 0.3
+MOST_CHANCE = 0.9
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,14 @@ def ground(buildings_m: FloatArray, areas_m2: NDArray[np.floating]) -> Ground:
     np.add.at(counts, (row, column), 1.0)
     mean = uniform_filter(counts, DENSITY_CELLS, mode="constant") / DENSITY_CELL_M**2
     return Ground(buildings_m, areas_m2, grid, np.maximum(mean, MIN_DENSITY_PER_M2))
+
+
+def density_at(points_m: FloatArray, reference: Ground) -> FloatArray:
+    """(N,) buildings per m2 around points (N, 2)."""
+    cells = (points_m - (reference.grid.west_m, reference.grid.south_m)) // DENSITY_CELL_M
+    last = np.array(reference.density_per_m2.shape)[::-1] - 1
+    column, row = np.clip(cells.astype(np.int64), 0, last).T
+    return np.asarray(reference.density_per_m2[row, column])
 
 
 @dataclass(frozen=True)
@@ -216,6 +225,26 @@ def area_evidence(
     chance = _normal(theirs - np.median(around), max(MIN_AREA_SPREAD, float(np.std(around))))
     likely = config.area_share * _normal(apart, config.sigma_log_area)
     return float(np.sum(np.log(likely / chance + 1.0 - config.area_share)))
+
+
+def absence_evidence(
+    matched: int, observable_m: FloatArray, buildings: int, reference: Ground, config: MatcherConfig
+) -> float:
+    """Nats, at most 0, from reference buildings (R, 2) that a map of so many buildings should show: of a true
+    place ``seen_share`` of them are ``matched``, of a wrong one as many as chance lays a building of the map
+    beside.
+
+    Where more are found than expected it says nothing: their places have been counted already.
+    """
+    expected = len(observable_m)
+    if expected == 0:
+        return 0.0
+    ours_per_m2 = float(density_at(observable_m, reference).mean()) * buildings / expected
+    chance = 1.0 - math.exp(-math.pi * config.mnn_distance_m**2 * ours_per_m2)
+    seen = config.seen_share
+    chance = min(chance, MOST_CHANCE * seen)  # a match always speaks for the place
+    found = matched * math.log(seen / chance)
+    return min(0.0, found + (expected - matched) * math.log((1.0 - seen) / (1.0 - chance)))
 
 
 def scale_evidence(scale: float, config: MatcherConfig) -> float:

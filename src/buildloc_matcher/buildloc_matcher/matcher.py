@@ -11,7 +11,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from buildloc_msgs_py.types import Candidate, Fix, FloatArray, FrameObservation, Keyframe, LocalMap, NoFix
 
-from buildloc_matcher.acceptance import lead, log_odds, refuse_coarse, refuse_refined
+from buildloc_matcher.acceptance import (
+    Outcome,
+    Verdict,
+    judge_candidate,
+    lead,
+    log_odds,
+    odds_against_all,
+    refuse_refined,
+)
 from buildloc_matcher.config import MatcherConfig, check_matcher
 from buildloc_matcher.evidence import QueryMap, query_map, seed_evidence
 from buildloc_matcher.geometry import Similarity
@@ -128,7 +136,7 @@ class Matcher:
                 found = mesh(points, areas, shapes, look.thinnings, look.max_stars)
             result = self._look(found, look.star_matcher, query, clock)
             result = replace(result, funnel=result.funnel | {"buildings": len(points), "looks": number})
-            if self.refuse(result) is None:
+            if self.judge(result).outcome is Outcome.ACCEPTED:
                 break
         return result
 
@@ -167,6 +175,7 @@ class Matcher:
         if candidates:
             funnel["lead"] = lead(candidates[0], candidates[1:], config)
             funnel["log_odds"] = candidates[0].acceptance
+            funnel["score"] = odds_against_all(candidates[0], candidates[1:], config)
         scores = tuple(score for _, score in selected)
         return MatchResult(candidates, scores, ballot.places_m, query, funnel, clock.seconds)
 
@@ -179,15 +188,16 @@ class Matcher:
         x, y = float(place[0]), float(place[1])
         return Candidate(x, y, near.yaw_rad, near.scale, votes, score.jaccard, odds)
 
-    def refuse(self, found: MatchResult) -> str | None:
-        """Why the best candidate of a map is not convincing, or None."""
+    def judge(self, found: MatchResult) -> Verdict:
+        """Whether the best candidate of a map is convincing, and why not."""
         buildings = found.funnel["buildings"]
+        few = f"map has {buildings:.0f} buildings, fewer than {self.config.min_buildings}"
         if buildings < self.config.min_buildings:
-            return f"map has {buildings:.0f} buildings, fewer than {self.config.min_buildings}"
+            return Verdict(Outcome.UNDECIDED, f"{Outcome.UNDECIDED}: {few}", -math.inf, 1.0)
         if not found.candidates:
-            return "no candidate: no place in the reference gathers enough consistent votes"
-        funnel = found.funnel
-        return refuse_coarse(found.scores[0], funnel["lead"], funnel["log_odds"], self.config)
+            nowhere = "no candidate: no place in the reference gathers enough consistent votes"
+            return Verdict(Outcome.REJECTED, f"{Outcome.REJECTED}: {nowhere}", -math.inf, 1.0)
+        return judge_candidate(found.candidates[0], found.candidates[1:], found.scores[0], self.config)
 
     def place(self, found: MatchResult, at_m: FloatArray) -> Similarity:
         """The best candidate's similarity map -> world around a point (2,) of the map."""
@@ -206,9 +216,9 @@ class Matcher:
 
         if not keyframes:
             return none("no keyframes yet")
-        refused = self.refuse(found)
-        if refused is not None:
-            return none(refused)
+        verdict = self.judge(found)
+        if verdict.reason is not None:
+            return none(verdict.reason)
         last = max(keyframes, key=lambda k: k.stamp_ns)
         coarse = self.place(found, np.array([last.x_m, last.y_m]))
         refined = refine(coarse, keyframes, observations, self.database.ground, self.config)

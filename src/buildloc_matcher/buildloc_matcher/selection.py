@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from buildloc_matcher.config import MatcherConfig
-from buildloc_matcher.evidence import Ground, QueryMap, area_evidence, placed_evidence, scale_evidence
+from buildloc_matcher.evidence import (
+    Ground,
+    QueryMap,
+    absence_evidence,
+    area_evidence,
+    placed_evidence,
+    scale_evidence,
+)
 from buildloc_matcher.geometry import Similarity, fit_similarity
 from buildloc_matcher.growth import Grown, grow
 from buildloc_matcher.hypotheses import Hypotheses
@@ -20,7 +27,7 @@ from buildloc_matcher.point_grid import near, nearest
 from buildloc_matcher.voting import Ballot, Cluster
 
 GROWN_SCORED = 10  # distinct grown matches that get the full score
-NEGLIGIBLE_NATS = 30.0  # a match that much less likely than the best is not listed
+NEGLIGIBLE_NATS = 60.0  # a match that much less likely than the best is not listed
 SHIFT_M = 100.0  # how far a match is moved to see whether it fits as well there
 LOCAL_M = 100.0
 FAR_WEIGHT = 1e-3
@@ -85,7 +92,12 @@ def mnn_jaccard(
 ) -> tuple[float, NDArray[np.int64]]:
     """J = |M| / (|Q| + |R| - |M|) of buildings (N, 2) in the world, and the pairs M (P, 2): rows of the map
     and of the reference. R are the reference's observable buildings."""
-    seen = observable(query_m, reference, config)
+    return _overlap(query_m, observable(query_m, reference, config), reference, config)
+
+
+def _overlap(
+    query_m: FloatArray, seen: NDArray[np.int64], reference: Ground, config: MatcherConfig
+) -> tuple[float, NDArray[np.int64]]:
     pairs = mutual_pairs(query_m, reference.buildings_m[seen], config.mnn_distance_m)
     union = len(query_m) + len(seen) - len(pairs)
     return (len(pairs) / union if union else 0.0), np.column_stack([pairs[:, 0], seen[pairs[:, 1]]])
@@ -110,23 +122,37 @@ def select(
         return []
     best = [cluster.best for cluster in ballot.clusters]
     seeds, places = corners[voters.stars[best]], voters.places_m[best]
-    grown = sorted(grow(query, seeds, places, reference, config), key=lambda found: -found[1].evidence)
-    if grown:
-        first = grown[0][0]
+    grown = grow(query, seeds, places, reference, config)
+    tested: set[int] = set()
+    while True:
+        scored = _scored_matches(grown, ballot, query, reference, config)
+        if not scored or scored[0][0] in tested:
+            return [(ballot.clusters[c], score) for c, score in scored]
+        first = scored[0][0]
+        tested.add(first)
         moved = shifted(places[first], reference, config)
         rivals = grow(
             query, np.repeat(seeds[first : first + 1], len(moved), axis=0), moved, reference, config
         )
         grown += [(first, match) for _, match in rivals]
-        grown.sort(key=lambda found: -found[1].evidence)
-    scored: list[tuple[Cluster, Score]] = []
-    for c, match in grown:
-        if len(scored) == GROWN_SCORED or match.evidence < grown[0][1].evidence - NEGLIGIBLE_NATS:
+
+
+def _scored_matches(
+    grown: list[tuple[int, Grown]],
+    ballot: Ballot,
+    query: QueryMap,
+    reference: Ground,
+    config: MatcherConfig,
+) -> list[tuple[int, Score]]:
+    """Distinct matches, each with the number of its cluster, in full, best first."""
+    ranked = sorted(grown, key=lambda found: -found[1].evidence)
+    scored: list[tuple[int, Score]] = []
+    for c, match in ranked:
+        if len(scored) == GROWN_SCORED or match.evidence < ranked[0][1].evidence - NEGLIGIBLE_NATS:
             break
-        cluster = ballot.clusters[c]
-        score = score_grown(_start(cluster, query), match, query, reference, config)
+        score = score_grown(_start(ballot.clusters[c], query), match, query, reference, config)
         if all(_apart(score, other) > config.mnn_distance_m for _, other in scored):
-            scored.append((cluster, score))
+            scored.append((c, score))
     return sorted(scored, key=lambda pair: -pair[1].evidence)
 
 
@@ -193,11 +219,13 @@ def _scored(
     reference: Ground,
     config: MatcherConfig,
 ) -> Score:
-    """``evidence`` is that of the places; those of the areas and of the scale are added."""
-    jaccard, pairs = mnn_jaccard(moved_m, reference, config)
+    """``evidence`` is that of the places; those of areas, scale and what is not seen are added."""
+    seen = observable(moved_m, reference, config)
+    jaccard, pairs = _overlap(moved_m, seen, reference, config)
     squared = np.sum((moved_m[pairs[:, 0]] - reference.buildings_m[pairs[:, 1]]) ** 2, axis=1)
     rms = math.sqrt(squared.mean()) if len(pairs) else math.inf
     around = reference.areas_m2[near(reference.grid, moved_m, config.observable_radius_m)]
     ours, theirs = query.areas_m2[pairs[:, 0]], reference.areas_m2[pairs[:, 1]]
     total = evidence + area_evidence(ours, theirs, around, config) + scale_evidence(transform.scale, config)
+    total += absence_evidence(len(pairs), reference.buildings_m[seen], len(moved_m), reference, config)
     return Score(transform, moved_m, pairs, rms, jaccard, total)

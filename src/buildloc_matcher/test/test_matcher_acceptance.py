@@ -7,7 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from buildloc_matcher.acceptance import lead, log_odds, refuse_coarse, refuse_refined
+from buildloc_matcher.acceptance import (
+    Outcome,
+    Verdict,
+    judge_candidate,
+    lead,
+    log_odds,
+    odds_against_all,
+    refuse_refined,
+)
+from buildloc_matcher.calibration import Tail, measured, threshold
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.geometry import Similarity
 from buildloc_matcher.refinement import Refined
@@ -42,22 +51,56 @@ def test_evidence_is_weighed_against_the_room_for_chance() -> None:
 GOOD = Score(Similarity((0, 0), (0, 0), 0.0), np.zeros((20, 2)), np.zeros((20, 2), np.int64), 2.0, 0.6, 60.0)
 
 
+def judged(best_nats: float, found: Score = GOOD, others: tuple[Candidate, ...] = ()) -> Verdict:
+    return judge_candidate(candidate(0.0, 0.0, best_nats), others, found, CONFIG)
+
+
+def test_the_score_is_the_odds_against_everything_else() -> None:
+    best, rival = candidate(0.0, 0.0, 50.0), candidate(100.0, 0.0, 50.0)
+    assert odds_against_all(best, [], CONFIG) == pytest.approx(50.0)
+    assert odds_against_all(best, [rival], CONFIG) == pytest.approx(0.0)
+    assert odds_against_all(best, [rival, rival], CONFIG) == pytest.approx(-math.log(2.0))  # two like it
+    beside = candidate(10.0, 0.0, 50.0)  # the same answer
+    assert odds_against_all(best, [beside], CONFIG) == pytest.approx(50.0)
+
+
+def test_three_outcomes() -> None:
+    enough = threshold(CONFIG.target_false_fix_rate)
+    fix = judged(enough + 0.1)
+    assert fix.outcome is Outcome.ACCEPTED and fix.reason is None
+    assert fix.false_fix_probability < CONFIG.target_false_fix_rate
+    chance = judged(-0.1)
+    assert chance.outcome is Outcome.REJECTED and "no more than chance: log-odds -0.1" in (
+        chance.reason or ""
+    )
+    between = judged(enough - 0.1)
+    assert between.outcome is Outcome.UNDECIDED and "could be chance: score" in (between.reason or "")
+    rival = candidate(500.0, 0.0, enough + 100.0)
+    ambiguous = judged(enough + 105.0, others=(rival,))
+    assert ambiguous.outcome is Outcome.UNDECIDED and "leads another place by 5.0" in (ambiguous.reason or "")
+
+
 @pytest.mark.parametrize(
-    ("score", "lead_nats", "odds", "text"),
+    ("found", "text"),
     [
-        (GOOD, 31.0, 29.9, "could be chance: log-odds 29.9, below 30"),
-        (replace(GOOD, jaccard=0.15), 31.0, 31.0, "MNN-Jaccard 0.15, below 0.2"),
-        (GOOD, 29.9, 31.0, "leads another place by 29.9 nats, below 30"),
-        (replace(GOOD, pairs=np.zeros((9, 2), np.int64)), 31.0, 31.0, "matches 9 buildings, fewer than 10"),
-        (replace(GOOD, rms_m=10.1), 31.0, 31.0, "residuals of 10.1 m, above 10 m"),
+        (replace(GOOD, jaccard=0.15), "MNN-Jaccard 0.15, below 0.2"),
+        (replace(GOOD, pairs=np.zeros((9, 2), np.int64)), "matches 9 buildings, fewer than 10"),
+        (replace(GOOD, rms_m=10.1), "residuals of 10.1 m, above 10 m"),
     ],
 )
-def test_each_figure_that_falls_short_is_named(
-    score: Score, lead_nats: float, odds: float, text: str
-) -> None:
-    reason = refuse_coarse(score, lead_nats, odds, CONFIG)
-    assert reason is not None and text in reason
-    assert refuse_coarse(GOOD, 30.0, 30.0, CONFIG) is None
+def test_each_figure_that_falls_short_is_named(found: Score, text: str) -> None:
+    verdict = judged(1000.0, found)
+    assert verdict.outcome is Outcome.UNDECIDED and text in (verdict.reason or "")
+    assert (verdict.reason or "").startswith("undecided: ")
+
+
+def test_the_threshold_follows_from_the_rate_asked_for() -> None:
+    tail = Tail(start_nats=4.0, share=0.1, scale_nats=3.0)
+    assert tail.exceedance(4.0) == pytest.approx(0.1) and tail.exceedance(-100.0) == 1.0
+    assert tail.quantile(0.1) == pytest.approx(4.0)
+    for rate in (1e-2, 1e-6):
+        assert tail.exceedance(tail.quantile(rate)) == pytest.approx(rate)
+    assert threshold(1e-6) > threshold(1e-5) > measured().start_nats
 
 
 def test_each_figure_of_the_refinement_that_falls_short_is_named() -> None:

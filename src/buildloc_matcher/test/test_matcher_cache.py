@@ -85,9 +85,9 @@ def test_a_used_matcher_answers_as_a_fresh_one(preset: str) -> None:
     fixed = 0
     for seen in maps:
         found, expected = used.locate(seen), Matcher(database, config).locate(seen)
-        assert same(found, expected) and used.refuse(found) == used.refuse(expected)
+        assert same(found, expected) and used.judge(found).reason == used.judge(expected).reason
         assert found.funnel["stars_matched_anew"] <= expected.funnel["stars_matched_anew"]
-        fixed += used.refuse(found) is None
+        fixed += used.judge(found).reason is None
     again = used.locate(maps[-1])
     assert again.funnel["stars_matched_anew"] == again.funnel["pairs_tested"] == 0
     assert fixed > 0

@@ -134,8 +134,8 @@ def test_a_mirrored_map_is_recognised_and_rejected() -> None:
     assert np.median(matches.score) == pytest.approx(1.0, abs=1e-5)
     assert hypotheses.mirrored > 0.9 * len(found.stars) > 100
     matcher = Matcher(city, DEFAULT)
-    assert matcher.refuse(matcher.locate(local_map(seen))) is None
-    assert matcher.refuse(matcher.locate(local_map(mirrored))) is not None
+    assert matcher.judge(matcher.locate(local_map(seen))).reason is None
+    assert matcher.judge(matcher.locate(local_map(mirrored))).reason is not None
 
 
 def circumradius(corners_m: FloatArray) -> float:

@@ -12,7 +12,9 @@ from buildloc_matcher.evidence import (
     NEIGHBOURS,
     NO_MATCH,
     WITNESSES,
+    absence_evidence,
     area_evidence,
+    density_at,
     placed_evidence,
     scale_evidence,
     seed_evidence,
@@ -139,3 +141,19 @@ def test_areas_speak_for_true_pairs_against_exchanged_ones_and_a_common_factor_i
 def test_a_wrong_scale_speaks_against() -> None:
     assert scale_evidence(1.0, DEFAULT) == 0.0
     assert scale_evidence(1.1, DEFAULT) == pytest.approx(-2.0) == pytest.approx(scale_evidence(0.9, DEFAULT))
+
+
+def test_what_is_not_seen_speaks_against_a_place() -> None:
+    # Ten buildings of a map over a hundred of the reference, 1.1 per 1000 m2 there: by chance a building of
+    # the reference has one of the map within 10 m in 1 - exp(-pi 100 1.1e-4) = 3.4 % of cases.
+    around = CITY.centroids_m[
+        np.argsort(np.hypot(*(CITY.centroids_m - CITY.centroids_m.mean(axis=0)).T))[:100]
+    ]
+    density = float(density_at(around, GROUND).mean())
+    assert density == pytest.approx(1.1e-3, rel=0.1)
+    chance = 1.0 - math.exp(-math.pi * DEFAULT.mnn_distance_m**2 * density * 10 / 100)
+    expected = 3 * math.log(0.5 / chance) + 97 * math.log(0.5 / (1.0 - chance))
+    assert absence_evidence(3, around, 10, GROUND, DEFAULT) == pytest.approx(expected) and expected < -50.0
+    # As many as a true place shows are counted where they lie, not here.
+    assert absence_evidence(60, around, 100, GROUND, DEFAULT) == 0.0
+    assert absence_evidence(0, np.empty((0, 2)), 10, GROUND, DEFAULT) == 0.0

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from buildloc_matcher.acceptance import Outcome
 from buildloc_matcher.config import MatcherConfig, matcher_config
 from buildloc_matcher.geometry import rotation
 from buildloc_matcher.local_map import MapError
@@ -40,11 +41,11 @@ def test_a_noisy_map_is_located_within_5_m(seed: int, count: int) -> None:
     seen = observed(TOWN, count, 1, seed)
     matcher = Matcher(HERE, DEFAULT)
     found = matcher.locate(seen.local_map)
-    assert matcher.refuse(found) is None
+    assert matcher.judge(found).reason is None
     best = found.candidates[0]
     assert math.hypot(best.x_m - seen.centre_m[0], best.y_m - seen.centre_m[1]) < 5.0
     # The map is the world seen at this scale and heading, so any two far buildings tell the yaw.
-    assert best.scale == pytest.approx(1.0, abs=0.05) and best.acceptance > DEFAULT.min_log_odds
+    assert best.scale == pytest.approx(1.0, abs=0.05) and best.acceptance > 30.0
     assert [c.acceptance for c in found.candidates] == sorted(
         (c.acceptance for c in found.candidates), reverse=True
     )
@@ -67,9 +68,10 @@ def test_the_wrong_town_gives_no_fix_and_says_why(seed: int) -> None:
     seen = observed(TOWN, 60, 1, seed)
     for config in (DEFAULT, PAPER):
         matcher = Matcher(whole(WRONG_TOWN, config), config)
-        reason = matcher.refuse(matcher.locate(seen.local_map))
-        assert reason is not None and "\n" not in reason
-        assert "could be chance" in reason or "no candidate" in reason
+        verdict = matcher.judge(matcher.locate(seen.local_map))
+        assert verdict.outcome is Outcome.REJECTED
+        assert verdict.reason is not None and "\n" not in verdict.reason
+        assert "no more than chance" in verdict.reason or "no candidate" in verdict.reason
     answer = Matcher(ELSEWHERE, DEFAULT).fix(seen.local_map, [Keyframe(0, 0.0, 0.0, 0.0)], [])
     assert isinstance(answer.result, NoFix) and answer.result.reason
 
@@ -83,7 +85,7 @@ def test_the_paper_preset_locates_a_map_that_does_not_bend() -> None:
     seen = LocalMap.whole(0, rows, points, city.areas_m2[rows], city.shapes[rows], np.ones_like(rows))
     matcher = Matcher(HERE_BY_PAPER, PAPER)
     found = matcher.locate(seen)
-    assert matcher.refuse(found) is None and len(found.candidates) == PAPER.top_k
+    assert matcher.judge(found).reason is None and len(found.candidates) == PAPER.top_k
     at = points.mean(axis=0)
     expected = at @ rotation(2.0) + middle
     place = matcher.place(found, at).apply(at[None])[0]
@@ -123,11 +125,11 @@ def test_a_second_look_finds_what_the_first_does_not() -> None:
         seen = observed(TOWN, 40, 2, seed).local_map
         first, both = (Matcher(HERE, config) for config in (once, DEFAULT))
         found, better = first.locate(seen), both.locate(seen)
-        if first.refuse(found) is None:
+        if first.judge(found).reason is None:
             assert better.funnel["looks"] == 1 and better.candidates == found.candidates
         else:
             assert better.funnel["looks"] == 2 and better.funnel["stars"] > found.funnel["stars"]
-            gained += both.refuse(better) is None
+            gained += both.judge(better).reason is None
     assert gained > 0
 
 
@@ -201,7 +203,7 @@ def test_small_maps_say_why_there_is_no_fix(count: int, config: MatcherConfig) -
     matcher = Matcher(whole(TOWN, config), config)
     some = first_rows(local_map(TOWN), count)
     found = matcher.locate(some)
-    assert matcher.refuse(found) == f"map has {count} buildings, fewer than 12"
+    assert matcher.judge(found).reason == f"undecided: map has {count} buildings, fewer than 12"
     assert found.funnel["buildings"] == count and (count > 3 or not found.candidates)
     answer = matcher.fix(some, [Keyframe(0, 0.0, 0.0, 0.0)], [])
     assert isinstance(answer.result, NoFix) and "fewer than 12" in answer.result.reason
@@ -210,7 +212,7 @@ def test_small_maps_say_why_there_is_no_fix(count: int, config: MatcherConfig) -
 def test_sheds_do_not_count() -> None:
     sheds = replace(local_map(TOWN), areas_m2=np.full(len(TOWN), 19.0))
     matcher = Matcher(HERE, DEFAULT)
-    assert matcher.refuse(matcher.locate(sheds)) == "map has 0 buildings, fewer than 12"
+    assert matcher.judge(matcher.locate(sheds)).reason == "undecided: map has 0 buildings, fewer than 12"
 
 
 LINE = np.outer(np.arange(40.0), [25.0, 3.0])
@@ -229,7 +231,7 @@ def test_maps_without_a_pattern_have_no_candidate(points: FloatArray, config: Ma
     matcher = Matcher(whole(TOWN, config), config)
     found = matcher.locate(local_map(buildings_at(points, 1)))
     assert found.candidates == () and found.funnel["stars"] == 0
-    assert "no candidate" in (matcher.refuse(found) or "")
+    assert "no candidate" in (matcher.judge(found).reason or "")
 
 
 def test_duplicates_do_no_harm() -> None:
@@ -252,7 +254,7 @@ def test_a_regular_pattern_is_nowhere_and_everywhere(west: int) -> None:
     column, row = np.divmod(np.arange(900), 30)
     block = grid.select(np.flatnonzero((column >= west) & (column < west + 12) & (row >= 8) & (row < 20)))
     matcher = Matcher(whole(grid), DEFAULT)
-    reason = matcher.refuse(matcher.locate(local_map(block)))
+    reason = matcher.judge(matcher.locate(local_map(block))).reason
     # It fits in 19 x 19 places and four headings; near the edge, where chance is rarer, a little better.
     assert reason is not None and "leads another place by" in reason
 
@@ -284,7 +286,7 @@ def test_a_map_of_100_000_buildings_is_located() -> None:
     matcher = Matcher(whole(city), DEFAULT)
     turned = Buildings((city.centroids_m - city.centroids_m[0]) @ rotation(1.0).T, city.areas_m2, city.shapes)
     found = matcher.locate(local_map(turned))
-    assert matcher.refuse(found) is None and found.funnel["stars"] <= MOST_STARS
+    assert matcher.judge(found).reason is None and found.funnel["stars"] <= MOST_STARS
     at = turned.centroids_m[500]
     place = matcher.place(found, at).apply(at[None])[0]
     assert np.hypot(*(place - city.centroids_m[500])) < 1.0  # a map without errors
@@ -295,7 +297,7 @@ def test_a_map_of_100_000_buildings_is_located() -> None:
 def test_a_huge_map_of_another_town_ends_with_a_reason_and_few_stars(config: MatcherConfig) -> None:
     matcher = Matcher(whole(TOWN, config), config)
     found = matcher.locate(local_map(town(112, 8000, 2600.0)))
-    assert matcher.refuse(found) is not None
+    assert matcher.judge(found).reason is not None
     # The bound on stars bounds memory: matches and hypotheses come from them.
     assert found.funnel["stars"] == MOST_STARS
     assert found.funnel["matches"] <= MOST_STARS * max(config.matches_per_star, config.second_look_matches)

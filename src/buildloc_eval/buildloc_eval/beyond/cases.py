@@ -93,6 +93,7 @@ ABLATIONS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
         "20 candidates": {"top_k": 20},
         "no evidence of areas": {"area_share": 0.0},
         "no evidence of scale": {"sigma_scale": 1.0},
+        "what is not seen hardly counts": {"seen_share": 0.05},
         "scale gate open": {"scale_gate": 0.9},
     },
     "paper": {

@@ -113,7 +113,7 @@ def ranking(matcher: Matcher, found: MatchResult) -> Prediction:
         return nothing("map has fewer than four buildings")
     kept = np.array([[c.x_m, c.y_m, c.yaw_rad, c.scale] for c in found.candidates[:KEPT]]).reshape(-1, 4)
     centre, bins = found.query.points_m.mean(axis=0), ranked_bins(found, matcher.config.bin_size_m)
-    refused, seconds = matcher.refuse(found), dict(found.seconds)
+    refused, seconds = matcher.judge(found).reason, dict(found.seconds)
     return Prediction(kept[:, :2], kept[:, 2:], centre, bins, None, refused, seconds, found.funnel)
 
 

@@ -48,7 +48,7 @@ OURS = "default preset"
 # What the report shows of a solve's funnel, in the order of the stages.
 FUNNEL = (
     "buildings", "stars", "matches", "hypotheses", "voters", "clusters", "rescored", "looks", "log_odds",
-    "lead",
+    "lead", "score",
 )  # fmt: skip
 REAL = [
     "real: the footprints (greater Boston, OpenStreetMap 2021) and the ground's texture (orthophotos of "

@@ -71,7 +71,8 @@ def rank_of_bin(found: Prediction, truth_m: FloatArray, radius_km: float) -> int
 def lost_by(found: Prediction, rank: int, bin_rank: int, radius_km: float) -> str:
     """The stage that lost a prediction whose first place is wrong."""
     if not len(found.places_m):
-        return found.refused or "no candidate"
+        no_map = found.refused or "no place"
+        return no_map if found.centre_m is None else "voting: no place gathers enough consistent votes"
     if rank > 1:
         return "ranking: a wrong candidate scored higher"
     if not len(found.bins):
