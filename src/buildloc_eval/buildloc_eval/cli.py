@@ -228,6 +228,8 @@ def run_eval(args: argparse.Namespace) -> int:
 
         given = {case.place: case.model for case in (parse_case(text, "--model") for text in args.models)}
         parts = args.parts or paper.PARTS
+        if given and "real" not in parts:
+            raise BuildlocError("--model is of the part real; add it to --parts")
         print(paper.evaluate(args.out, args.seed, args.quick, _stage, parts, given))
     elif args.name == "segmentation":
         from buildloc_eval import segmentation

@@ -159,7 +159,7 @@ def real_part(
     planned = [flight for flight in (*real.FLIGHTS, real.SHORT) if flight.name in plan.flights]
     found, left_out = real.networks(planned, networks)
     flights = [flight for flight in planned if flight.place in found]
-    city, stores = cache(read_boston), dict[str, Stores]()
+    city, stores = cache(real.read_city), dict[str, Stores]()
     for flight in flights:
         network = found[flight.place]
         stores[flight.name] = real.stores_for(out, flight, network, models, seed)

@@ -17,7 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 import shapely
-from buildloc_matcher.reference.buildings import Buildings
+from buildloc_matcher.reference.buildings import Buildings, concatenate
 from buildloc_msgs_py import topics
 from buildloc_msgs_py.types import ByteArray, FloatArray, Mask
 from buildloc_segmenter.config import SegmenterConfig
@@ -32,7 +32,7 @@ from buildloc_eval.paper.flights import EPSG
 from buildloc_eval.paper.flown import Maps, Track, frames, limit_threads, link, map_flight, shots
 from buildloc_eval.paper.plan import Models, Plan, Stores, maps_name
 from buildloc_eval.paper.published import LARGE_RADII_KM
-from buildloc_eval.paper.sources import measure, usable
+from buildloc_eval.paper.sources import measure, read_boston, usable
 from buildloc_eval.paper.stages import Area, Job, Say, Search, predict, side_by_side
 from buildloc_eval.paper.store import Store
 from buildloc_eval.realworld import HOLE_MARGIN_M, data_folder
@@ -171,22 +171,34 @@ def draw_site(centroids_m: FloatArray, radius_m: float, rng: np.random.Generator
     return np.asarray(inside[rng.integers(len(inside))])
 
 
-def set_in(
-    city: Outlines, ground: LabelledGround, at_m: FloatArray, radius_m: float
-) -> tuple[FloatArray, Outlines]:
-    """The move (2,) that brings the middle of a ground's labelled part to a place of a city, and the outlines
-    within the radius: the city's outside of that part, then the ground's own."""
+@dataclass(frozen=True)
+class City:
+    """Outlines (N,) and what a reference knows of each."""
+
+    outlines: Outlines
+    measured: Buildings
+
+
+def read_city() -> City:
+    """Greater Boston."""
+    outlines = read_boston()
+    return City(outlines, measure(outlines))
+
+
+def set_in(city: City, ground: LabelledGround, at_m: FloatArray, radius_m: float) -> Site:
+    """Bring the middle of a ground's labelled part to a place of a city, whose buildings there give way."""
     west, south, east, north = labelled_m(ground)
     moved = at_m - ((west + east) / 2.0, (south + north) / 2.0)
     hole = shapely.box(west, south, east, north).buffer(HOLE_MARGIN_M, join_style="mitre")
     hole = shapely.transform(hole, lambda xy: xy + moved)
-    near = city[np.hypot(*(shapely.get_coordinates(shapely.centroid(city)) - at_m).T) <= radius_m]
+    near = np.flatnonzero(np.hypot(*(city.measured.centroids_m - at_m).T) <= radius_m)
+    kept = near[~shapely.intersects(city.outlines[near], hole)]
     own = shapely.transform(usable(ground.outlines), lambda xy: xy + moved)
-    return moved, np.concatenate([near[~shapely.intersects(near, hole)], own])
+    return Site(moved, at_m, concatenate([city.measured.select(kept), measure(own)]))
 
 
 def make_sites(
-    store: Store, flight: RealFlight, seeds: Sequence[int], read: Callable[[], Outlines], say: Say
+    store: Store, flight: RealFlight, seeds: Sequence[int], read: Callable[[], City], say: Say
 ) -> None:
     """Keep the site of every seed, with the reference within the largest radius."""
     missing = [s for s in seeds if not store.has(maps_name(flight, s))]
@@ -194,14 +206,10 @@ def make_sites(
         return
     say(f"setting {flight.place} into greater Boston")
     city, ground = read(), flight.read(data_folder())
-    centres, number = (
-        shapely.get_coordinates(shapely.centroid(city)),
-        [f.place for f in FLIGHTS].index(flight.place),
-    )
+    number = [f.place for f in FLIGHTS].index(flight.place)
     for s in missing:
-        at = draw_site(centres, RADIUS_M, np.random.default_rng([s, 8, number]))
-        moved, outlines = set_in(city, ground, at, RADIUS_M)
-        store.save(maps_name(flight, s), Site(moved, at, measure(outlines)))
+        at = draw_site(city.measured.centroids_m, RADIUS_M, np.random.default_rng([s, 8, number]))
+        store.save(maps_name(flight, s), set_in(city, ground, at, RADIUS_M))
 
 
 def region(labelled: Box, config: FlightConfig, rng: np.random.Generator) -> Box:
@@ -283,7 +291,7 @@ def stores_for(out: Path, flight: RealFlight, network: Trained, models: Models, 
 
 
 def run(
-    stores: Stores, flight: RealFlight, network: Trained, read: Callable[[], Outlines], plan: Plan,
+    stores: Stores, flight: RealFlight, network: Trained, read: Callable[[], City], plan: Plan,
     models: Models, seed: int, say: Say,
 ) -> None:  # fmt: skip
     """Every stage of what is not there yet; ``read`` gives the city."""
