@@ -152,7 +152,9 @@ def run_demo(args: argparse.Namespace) -> int:
 def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `buildloc eval`."""
     parser.add_argument(
-        "name", choices=["barnarp", "mapping", "paper", "scale", "segmentation"], help="which evaluation"
+        "name",
+        choices=["barnarp", "beyond", "mapping", "paper", "scale", "segmentation"],
+        help="which evaluation",
     )
     parser.add_argument(
         "-o", "--out", type=Path, required=True, help="folder for report.json and report.html"
@@ -212,6 +214,10 @@ def run_eval(args: argparse.Namespace) -> int:
 
         levels = None if args.levels is None else tuple(args.levels)
         print(scale.evaluate(args.out, args.seed, args.quick, _stage, levels))
+    elif args.name == "beyond":
+        from buildloc_eval.beyond import evaluate as beyond
+
+        print(beyond.evaluate(args.out, args.seed, args.quick, _stage))
     elif args.name == "mapping":
         from buildloc_eval import mapping
 

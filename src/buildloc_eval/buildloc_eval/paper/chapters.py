@@ -25,6 +25,7 @@ from buildloc_eval.paper.report import (
     convergence_pictures,
     convergence_table,
     failure_table,
+    failures_one_by_one,
     judged,
     methods_of,
     runtime_table,
@@ -130,6 +131,7 @@ def told(
         "flights and references": list(flown),
         "results": results_table(scored, groups),
         "failures": failure_table(scored),
+        f"failures of the {OURS}, one by one": failures_one_by_one(scored, OURS),
         "convergence": convergence_table(traces),
         "time of a query": runtime_table(scored, radii),
         "plan": asdict(plan),
@@ -167,7 +169,7 @@ def two_digitisers(
     }
     drawn = figures.draw_trajectories(out / "trajectories.png", around, paths)
     pictures = [("Flights over what they see (simulated flights, real footprints)", drawn)]
-    return Chapter("Two digitisers: Tokyo", said, bars, pictures + convergence_pictures(out, traces, seed))
+    return Chapter("Two digitisers: Tokyo", said, bars, pictures + convergence_pictures(out, traces))
 
 
 def real_imagery(
@@ -201,4 +203,4 @@ def real_imagery(
     if flights:
         drawn = figures.draw_trajectories(out / "real_trajectories.png", around, paths)
         pictures = [("Flights of the first seed over the outlines of the reference", drawn)]
-    return Chapter("Real imagery", said, bars, pictures + convergence_pictures(out, traces, seed))
+    return Chapter("Real imagery", said, bars, pictures + convergence_pictures(out, traces))

@@ -31,7 +31,7 @@ TRACK_CODE = (
 )  # fmt: skip
 MAP_CODE = (*TRACK_CODE, *GROUND_CODE, f"{PAPER}.brm", "buildloc_eval.segmentation_errors")
 PREDICTION_CODE = (
-    *MAP_CODE, "buildloc_matcher", "buildloc_eval.generators", "buildloc_eval.scale", f"{PAPER}.methods"
+    *MAP_CODE, "buildloc_matcher", "buildloc_eval.generators", f"{PAPER}.methods"
 )  # fmt: skip
 
 
@@ -50,9 +50,9 @@ class Plan:
 
 FULL = Plan(
     tuple(f"flight{n}" for n in range(1, 8)), 10, RADII_KM,
-    {"default preset": LARGE_RADII_KM, "paper preset": (6,)}, 1
+    {"default preset": LARGE_RADII_KM, "paper preset": LARGE_RADII_KM}, 10
 )  # fmt: skip
-QUICK = Plan(("flight1", "flight2"), 2, (1, 6, 12), {"default preset": (6,)}, 1)
+QUICK = Plan(("flight1", "flight2"), 2, (1, 6, 12), {"default preset": (6,), "paper preset": (6,)}, 2)
 
 
 @dataclass(frozen=True)

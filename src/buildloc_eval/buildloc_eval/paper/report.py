@@ -38,12 +38,18 @@ from buildloc_eval.paper.scoring import (
     bins_within,
     error_row,
     first_and_stable,
+    mean_interval,
     recall_row,
     score,
 )
 from buildloc_eval.segmentation_errors import Outlines
 
 OURS = "default preset"
+# What the report shows of a solve's funnel, in the order of the stages.
+FUNNEL = (
+    "buildings", "stars", "matches", "hypotheses", "voters", "clusters", "rescored", "looks", "log_odds",
+    "lead", "score",
+)  # fmt: skip
 REAL = [
     "real: the footprints (greater Boston, OpenStreetMap 2021) and the ground's texture (orthophotos of "
     "Barnarp and Banepa, mirrored); registration, mapping, matching and refinement are the system's own",
@@ -74,7 +80,7 @@ class Trial:
     flight: str
     seed: int
     score: Score
-    seconds: dict[str, float]
+    prediction: Prediction
 
 
 def trials(stores: Stores, flights: Sequence[Flight], plan: Plan, seed: int) -> list[Trial]:
@@ -87,7 +93,7 @@ def trials(stores: Stores, flights: Sequence[Flight], plan: Plan, seed: int) -> 
                 for name in plan.methods:
                     prediction = stores.predictions.load(prediction_name(name, radius, flight, s, False))
                     scored = score(prediction, maps, len(maps.snapshots), radius)
-                    found.append(Trial(name, radius, flight.name, s, scored, dict(prediction.seconds)))
+                    found.append(Trial(name, radius, flight.name, s, scored, prediction))
     return found
 
 
@@ -195,23 +201,28 @@ def converged(stores: Stores, flights: Sequence[Flight], plan: Plan, seed: int) 
 
 
 def convergence_table(all_of: Sequence[Converged]) -> list[dict[str, Any]]:
-    """Mean keyframes to the first and the stable success, over the flights that have one, and the paper's."""
+    """Mean keyframes to the first and the stable success, over the flights of all seeds that have one; its
+    95 % interval, from the scatter of the seeds' means; the paper's; by flight the mean and the ends."""
     rows = []
     for name, radius in dict.fromkeys((c.method, c.radius_km) for c in all_of):
         mine = [c for c in all_of if (c.method, c.radius_km) == (name, radius)]
-        first, stable = ([getattr(c, kind) for c in mine] for kind in ("first", "stable"))
         column = LARGE_RADII_KM.index(radius) if radius in LARGE_RADII_KM else None
         row: dict[str, Any] = {"method": name, "radius_km": radius, "flights": len(mine)}
-        for kind, values, published in (
-            ("first success", first, FIRST_SUCCESS), ("stable success", stable, STABLE_SUCCESS)
-        ):  # fmt: skip
-            reached = [v for v in values if v is not None]
-            row[kind] = float(np.mean(reached)) if reached else None
-            row[f"{kind}, flights"] = len(reached)
-            row[f"{kind}, paper's"] = None if column is None else published[column]
-        row["by flight, first"] = ", ".join(f"{c.flight}: {c.first}" for c in mine)
-        row["by flight, stable"] = ", ".join(f"{c.flight}: {c.stable}" for c in mine)
-        rows.append(row)
+        by_flight: dict[str, str] = {}
+        for kind, published in (("first", FIRST_SUCCESS), ("stable", STABLE_SUCCESS)):
+            reached = [(c, getattr(c, kind)) for c in mine if getattr(c, kind) is not None]
+            row[f"{kind} success"] = float(np.mean([n for _, n in reached])) if reached else None
+            seeds = [[n for c, n in reached if c.seed == seed] for seed in {c.seed for c, _ in reached}]
+            row[f"{kind} success_95%"] = mean_interval([float(np.mean(some)) for some in seeds])
+            row[f"{kind} success, flights"] = len(reached)
+            row[f"{kind} success, paper's"] = None if column is None else published[column]
+            parts = []
+            for flight in dict.fromkeys(c.flight for c in mine):
+                some = [n for c, n in reached if c.flight == flight]
+                told = f"{np.mean(some):.1f} ({min(some)} to {max(some)})" if some else "never"
+                parts.append(f"{flight}: {told}")
+            by_flight[f"by flight, {kind}"] = ", ".join(parts)
+        rows.append(row | by_flight)
     return rows
 
 
@@ -231,7 +242,8 @@ def runtime_table(scored: Sequence[Trial], radii_km: Sequence[int]) -> list[dict
     rows = []
     for name in methods_of(scored):
         for radius in radii_km:
-            mine = [t.seconds for t in scored if (t.method, t.radius_km) == (name, radius) and t.seconds]
+            asked = [t.prediction for t in scored if (t.method, t.radius_km) == (name, radius)]
+            mine = [prediction.seconds for prediction in asked if prediction.seconds]
             stages = dict.fromkeys(stage for seconds in mine for stage in seconds)
             row: dict[str, Any] = {"method": name, "radius_km": radius}
             row["total_ms"] = 1e3 * float(np.median([sum(s.values()) for s in mine])) if mine else None
@@ -244,7 +256,7 @@ def runtime_table(scored: Sequence[Trial], radii_km: Sequence[int]) -> list[dict
 
 
 def failure_table(scored: Sequence[Trial]) -> list[dict[str, Any]]:
-    """What lost the trials whose first place is wrong, and which they were."""
+    """What lost the trials whose first place is wrong, which they were, and the median of their funnel."""
     rows = []
     for name in methods_of(scored):
         lost = [t for t in scored if t.method == name and t.score.lost_by]
@@ -252,8 +264,30 @@ def failure_table(scored: Sequence[Trial]) -> list[dict[str, Any]]:
             mine = [t for t in lost if t.score.lost_by == reason]
             where = Counter(f"{t.flight} at {t.radius_km} km" for t in mine)
             places = ", ".join(f"{place}: {n}" for place, n in where.most_common())
-            rows.append({"method": name, "lost by": reason, "trials": count, "where": places})
+            row = {"method": name, "lost by": reason, "trials": count, "where": places}
+            rows.append(row | {stage: _median_of(mine, stage) for stage in FUNNEL})
     return rows
+
+
+def _median_of(trials: Sequence[Trial], stage: str) -> float | None:
+    counts = [t.prediction.funnel[stage] for t in trials if stage in t.prediction.funnel]
+    return float(np.median(counts)) if counts else None
+
+
+def failures_one_by_one(scored: Sequence[Trial], method: str) -> list[dict[str, Any]]:
+    """Every trial of a method whose first place is wrong: where it went, why it was or was not refused as a
+    fix, and its funnel."""
+    return [
+        {
+            "flight": t.flight, "radius_km": t.radius_km, "seed": t.seed, "lost by": t.score.lost_by,
+            "rank": t.score.rank or None, "rank of the true bin": t.score.bin_rank,
+            "first place off, m": t.score.coarse_m if math.isfinite(t.score.coarse_m) else None,
+            "refused": t.prediction.refused,
+            **{stage: t.prediction.funnel.get(stage) for stage in FUNNEL},
+        }
+        for t in scored
+        if t.method == method and t.score.lost_by
+    ]  # fmt: skip
 
 
 def bars(scored: Sequence[Trial], traces: Sequence[Converged]) -> list[dict[str, Any]]:
@@ -267,13 +301,19 @@ def bars(scored: Sequence[Trial], traces: Sequence[Converged]) -> list[dict[str,
     finals = [s.final_m for s in large if s.rank == 1 and math.isfinite(s.final_m)]
     stable = [c.stable for c in traces if c.method == OURS and c.radius_km == 6]
     reached = [s for s in stable if s is not None]
-    mean = float(np.mean(reached)) if reached and len(reached) == len(stable) else None
+    mean = float(np.mean(reached)) if reached else None
     # What, bar, measured, whether more is better, whether this run can tell.
     rows = [
         ("default preset, recall@1 at 6 and 9 km", 1.0, recall(OURS, (6, 9)), True, None),
         ("default preset, recall@1 at 12 km", 0.97, recall(OURS, (12,)), True, None),
         ("paper preset, recall@1 at 12 km (paper: 5/7)", None, recall("paper preset", (12,)), True, None),
-        ("keyframes to stable success at 6 km, mean over all flights", 30.0, mean, False, bool(stable)),
+        (
+            f"keyframes to stable success at 6 km, mean of the {len(reached)} of {len(stable)} that reach it",
+            30.0,
+            mean,
+            False,
+            bool(stable),
+        ),
         ("final error, median, m", 10.0, float(np.median(finals)) if finals else None, False, bool(large)),
         ("final error, worst, m", 30.0, max(finals) if finals else None, False, bool(large)),
     ]
@@ -324,6 +364,7 @@ def boston(
         "convergence": convergence_table(traces),
         "time of a query": runtime_table(scored, plan.radii_km),
         "failures": failure_table(scored),
+        f"failures of the {OURS}, one by one": failures_one_by_one(scored, OURS),
         "error models": asdict(models),
         "plan": asdict(plan),
     }
@@ -367,7 +408,7 @@ def draw(
             figures.draw_trajectories(out / "trajectories.png", around, paths),
         )
     ]
-    pictures += convergence_pictures(out, traces, seed)
+    pictures += convergence_pictures(out, traces)
     rows = {name: radius_row(scored, name, plan.radii_km) for name in METHODS}
     drawn = figures.draw_radius(out / "radius.png", plan.radii_km, rows)
     pictures.append(("Recall, coarse error and time against the search radius", drawn))
@@ -386,17 +427,21 @@ def draw(
     return pictures
 
 
-def convergence_pictures(out: Path, traces: Sequence[Converged], seed: int) -> list[tuple[str, Path]]:
-    """The rank of the true bin over the keyframes of a seed, for each method and radius."""
+def convergence_pictures(out: Path, traces: Sequence[Converged]) -> list[tuple[str, Path]]:
+    """The rank of the true bin over the keyframes of all seeds, for each method and radius."""
     pictures = []
     for name, radius in dict.fromkeys((c.method, c.radius_km) for c in traces):
-        mine = [
-            figures.Trace(c.flight, c.ranks, c.stable_rank)
-            for c in traces
-            if (c.method, c.radius_km, c.seed) == (name, radius, seed)
-        ]
+        mine = [c for c in traces if (c.method, c.radius_km) == (name, radius)]
+        drawn = []
+        for flight in dict.fromkeys(c.flight for c in mine):
+            of = [c for c in mine if c.flight == flight]
+            stable = [c.stable_rank for c in of if c.stable_rank is not None]
+            median = float(np.median(stable)) if len(stable) == len(of) else None
+            shortest = min(len(c.ranks) for c in of)
+            ranks = np.array([c.ranks[:shortest] for c in of])
+            drawn.append(figures.Trace(flight, ranks, median))
         path = out / f"convergence_{name.replace(' ', '_')}_{radius}km.png"
-        figures.draw_convergence(path, mine, radius, bins_within(radius))
+        figures.draw_convergence(path, drawn, radius, bins_within(radius))
         pictures.append((f"Rank of the true bin as keyframes accumulate: {name}, {radius} km", path))
     return pictures
 
@@ -415,7 +460,7 @@ def radius_row(
     row: dict[str, list[float | None]] = {"recall@1": [], "coarse error, m": [], "seconds per query": []}
     for radius in radii_km:
         mine = [t for t in scored if (t.method, t.radius_km) == (method, radius)]
-        times = [sum(t.seconds.values()) for t in mine if t.seconds]
+        times = [sum(t.prediction.seconds.values()) for t in mine if t.prediction.seconds]
         row["recall@1"].append(sum(t.score.rank == 1 for t in mine) / len(mine))
         row["coarse error, m"].append(error_row([t.score for t in mine])["coarse_median_m"])
         row["seconds per query"].append(float(np.median(times)) if times else None)

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from buildloc_matcher.matching import THREADS
@@ -45,16 +46,23 @@ class Progress:
 
 def side_by_side(jobs: Sequence[Job], store: Store, stage: str, say: Say) -> None:
     """Make what is not there yet on all cores; the costliest first."""
-    missing = sorted((job for job in jobs if not store.has(job[0])), key=lambda job: -job[1])
-    if not missing:
+    for name, made in run_all([job for job in jobs if not store.has(job[0])], stage, say):
+        store.save(name, made)
+
+
+def run_all(jobs: Sequence[Job], stage: str, say: Say) -> Iterator[tuple[str, Any]]:
+    """Results by name, as they are finished, of jobs on all cores; the costliest first."""
+    if not jobs:
         return
-    progress = Progress(say, stage, sum(cost for _, cost, _ in missing))
+    progress = Progress(say, stage, sum(cost for _, cost, _ in jobs))
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(THREADS, len(missing)), context) as pool:
-        running = {pool.submit(make): (name, cost) for name, cost, make in missing}
+    with ProcessPoolExecutor(min(THREADS, len(jobs)), context) as pool:
+        running = {
+            pool.submit(make): (name, cost) for name, cost, make in sorted(jobs, key=lambda job: -job[1])
+        }
         for done in as_completed(running):
             name, cost = running[done]
-            store.save(name, done.result())
+            yield name, done.result()
             progress.step(name, cost)
 
 
@@ -111,34 +119,33 @@ class Search:
 
 def predict(stores: Stores, searches: Sequence[Search], plan: Plan, seed: int, say: Say) -> None:
     """The star methods' predictions that are not there yet."""
-    asked = [
-        [
-            q
-            for q in queries(search.flight, plan, seed)
-            if q.seed in search.seeds and not stores.predictions.has(q.name)
+    jobs: list[Job] = []
+    for search in searches:
+        asked = [
+            query
+            for query in queries(search.flight, plan, seed)
+            if query.seed in search.seeds and not stores.predictions.has(query.name)
         ]
-        for search in searches
-    ]
-    progress = Progress(say, "locating", sum(query.cost for some in asked for query in some))
-    for search, some in zip(searches, asked, strict=True):
-        if some:
-            locate_all(stores, search.area(), some, progress)
+        for radius in dict.fromkeys(query.radius_km for query in asked):
+            here = tuple(query for query in asked if query.radius_km == radius)
+            name = f"{search.flight.name}, {radius} km"
+            jobs.append((name, sum(q.cost for q in here), partial(locate_all, stores, search.area, here)))
+    for _ in run_all(jobs, "locating", say):
+        pass  # every prediction is kept as soon as it is made
 
 
-def locate_all(stores: Stores, area: Area, asked: Sequence[Query], progress: Progress) -> None:
-    """Predictions within one area: its database is made once for a radius, a matcher once for a method."""
-    for radius in dict.fromkeys(query.radius_km for query in asked):
-        here = [query for query in asked if query.radius_km == radius]
-        database = methods.reference_within(area.buildings, area.centre_m, radius, area.epsg)
-        for name in dict.fromkeys(query.method for query in here):
-            matcher = methods.make_matcher(name, database)
-            for query in (q for q in here if q.method == name):
-                maps = stores.maps.load(maps_name(query.flight, query.seed))
-                count = len(maps.snapshots)
-                found: Prediction | list[Prediction]
-                if query.prefixes:
-                    found = [methods.locate(matcher, maps, n, final=False) for n in range(1, count + 1)]
-                else:
-                    found = methods.locate(matcher, maps, count, final=True)
-                stores.predictions.save(query.name, found)
-                progress.step(query.name, query.cost)
+def locate_all(stores: Stores, where: Callable[[], Area], asked: Sequence[Query]) -> None:
+    """Predictions within one radius of an area: its database is made once, a matcher once for a method."""
+    area = where()
+    database = methods.reference_within(area.buildings, area.centre_m, asked[0].radius_km, area.epsg)
+    for name in dict.fromkeys(query.method for query in asked):
+        matcher = methods.make_matcher(name, database)
+        for query in (q for q in asked if q.method == name):
+            maps = stores.maps.load(maps_name(query.flight, query.seed))
+            count = len(maps.snapshots)
+            found: Prediction | list[Prediction]
+            if query.prefixes:
+                found = [methods.locate(matcher, maps, n, final=False) for n in range(1, count + 1)]
+            else:
+                found = methods.locate(matcher, maps, count, final=True)
+            stores.predictions.save(query.name, found)
