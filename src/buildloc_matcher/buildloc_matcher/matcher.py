@@ -28,7 +28,7 @@ from buildloc_matcher.local_map import check_map
 from buildloc_matcher.match_cache import MakeStarMatcher, MatchCache, StarMatcher
 from buildloc_matcher.mesh import Mesh, mesh
 from buildloc_matcher.reference.database import DatabaseError, ReferenceDatabase, descriptor_hash
-from buildloc_matcher.refinement import covariance_enu, refine
+from buildloc_matcher.refinement import Unrefined, covariance_enu, refine
 from buildloc_matcher.selection import Score, local_transform, select
 from buildloc_matcher.voting import Cluster, vote
 
@@ -222,14 +222,18 @@ class Matcher:
         last = max(keyframes, key=lambda k: k.stamp_ns)
         coarse = self.place(found, np.array([last.x_m, last.y_m]))
         refined = refine(coarse, keyframes, observations, self.database.ground, self.config)
+        if isinstance(refined, Unrefined):
+            return none(refined.reason)
         refused = refuse_refined(refined, self.config)
-        if refined is None or refused is not None:
-            return none(refused or "refinement failed")
+        if refused is not None:
+            return none(refused)
         funnel |= {"refine_observed": refined.observed, "refine_pairs": refined.pairs}
         funnel |= {"refine_buildings": refined.buildings, "refine_rms_m": refined.rms_m}
         altitude = next((o.altitude_m for o in observations if o.stamp_ns == last.stamp_ns), float("nan"))
         east, north = float(refined.position_m[0]), float(refined.position_m[1])
         latitude, longitude = self.database.to_wgs84(east, north)
-        covariance = covariance_enu(refined, self.config)
-        fix = Fix(last.stamp_ns, latitude, longitude, altitude, east, north, refined.yaw_rad, covariance)
+        fix = Fix(
+            last.stamp_ns, latitude, longitude, altitude, east, north, refined.yaw_rad,
+            covariance_enu(refined, self.config), float(refined.covariance[2, 2]),
+        )  # fmt: skip
         return Answer(fix, found.candidates, funnel)

@@ -183,7 +183,7 @@ def encode_fix(fix: Fix | NoFix) -> NavSatFix:
 
 
 def encode_pose(fix: Fix) -> PoseWithCovarianceStamped:
-    """The fix in the metric world frame (UTM easting, northing) with its heading."""
+    """The fix in the metric world frame (UTM easting, northing) with its heading; a wide one if unknown."""
     msg = PoseWithCovarianceStamped(header=header(fix.stamp_ns, topics.FRAME_WORLD))
     msg.pose.pose.position.x = float(fix.easting_m)
     msg.pose.pose.position.y = float(fix.northing_m)
@@ -192,5 +192,7 @@ def encode_pose(fix: Fix) -> PoseWithCovarianceStamped:
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = fix.covariance_enu_m2
     covariance[3, 3] = covariance[4, 4] = covariance[5, 5] = LEVEL_SIGMA_RAD**2
+    if math.isfinite(fix.yaw_variance_rad2):
+        covariance[5, 5] = fix.yaw_variance_rad2
     msg.pose.covariance = [float(v) for v in covariance.ravel()]
     return msg

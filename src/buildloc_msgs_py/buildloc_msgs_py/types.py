@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -142,7 +143,8 @@ class Candidate:
 class Fix:
     """An accepted position of the camera at ``stamp_ns`` (the image's capture time).
 
-    ``covariance_enu_m2`` is (3, 3) east, north, up. ``yaw_rad`` is the ENU heading of image-right.
+    ``covariance_enu_m2`` is (3, 3) east, north, up. ``yaw_rad`` is the ENU heading of image-right, and
+    ``yaw_variance_rad2`` its variance, NaN where it is not known.
     """
 
     stamp_ns: int
@@ -153,6 +155,7 @@ class Fix:
     northing_m: float
     yaw_rad: float
     covariance_enu_m2: FloatArray
+    yaw_variance_rad2: float = math.nan
 
 
 @dataclass(frozen=True)

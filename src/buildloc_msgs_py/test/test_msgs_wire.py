@@ -240,3 +240,5 @@ def test_pose(travel: Travel) -> None:
     assert message.header.frame_id == "map"
     assert wire.decode_pose(message) == pytest.approx((317000.5, 4701000.25, 0.7))
     assert np.array_equal(np.reshape(message.pose.covariance, (6, 6))[:3, :3], FIX.covariance_enu_m2)
+    surer = encode.encode_pose(replace(FIX, yaw_variance_rad2=1e-4))
+    assert surer.pose.covariance[35] == 1e-4 < message.pose.covariance[35]
