@@ -9,7 +9,7 @@ from typing import Any
 from buildloc_msgs_py import encode, qos, topics, wire
 from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.ros_node import Diagnostics, FrameAssembler, declare_config, run_node
-from buildloc_msgs_py.types import Frame, Keyframe, Mask
+from buildloc_msgs_py.types import Frame, Mask, Tracked
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Path
@@ -20,7 +20,6 @@ from std_srvs.srv import Trigger
 
 from buildloc_mapper.config import MapperConfig
 from buildloc_mapper.mapper import Mapper
-from buildloc_mapper.tracking import Tracked
 
 FRAMES_KEPT = 100  # that wait for a mask; a busy segmenter may lag by seconds
 
@@ -60,10 +59,7 @@ class MapperNode(Node):  # type: ignore[misc]
             self._report(DiagnosticStatus.WARN, str(error))
             return
         if isinstance(answer, Tracked):
-            pose, covariance = self._mapper.on_map(answer)
-            self._track.publish(
-                encode.encode_tracked(Keyframe(frame.stamp_ns, *pose), frame.altitude_m, covariance)
-            )
+            self._track.publish(encode.encode_tracked(answer))
         self._tracked += isinstance(answer, Tracked)
         self._lost += not isinstance(answer, Tracked)
         self._track_after_s = 2.0 * time.monotonic() - started
