@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +28,8 @@ class Refined:
     buildings: int
     rms_m: float
     variance_m2: float
+    poses: Mapping[int, tuple[float, float, float]]
+    covariance: FloatArray
 
 
 def observed_in_world(
@@ -86,14 +88,18 @@ def refine(
     matched = nearest[close]
     rms = math.sqrt(float(np.mean(distance[close] ** 2)))
     distinct = np.unique(matched)
+    variance = horizontal_variance(position[0], reference_m[distinct], rms, config)
+    yaw = math.atan2(math.sin(yaw), math.cos(yaw))
     return Refined(
         position[0],
-        math.atan2(math.sin(yaw), math.cos(yaw)),
+        yaw,
         len(points),
         int(close.sum()),
         len(distinct),
         rms,
-        horizontal_variance(position[0], reference_m[distinct], rms, config),
+        variance,
+        {last.stamp_ns: (float(position[0, 0]), float(position[0, 1]), yaw)},
+        np.diag([variance, variance, math.radians(2.0) ** 2]),
     )
 
 
@@ -112,6 +118,10 @@ def horizontal_variance(
     return max(config.sigma_floor_m**2, config.sigma_inflation**2 * variance)
 
 
-def covariance_enu(refined: Refined, config: MatcherConfig) -> FloatArray:
-    """(3, 3) m2, east, north, up. The altitude is above ground, not above the ellipsoid: wide."""
-    return np.diag([refined.variance_m2, refined.variance_m2, config.sigma_up_m**2])
+def covariance_enu(covariance: FloatArray, config: MatcherConfig) -> FloatArray:
+    """(3, 3) m2, east, north, up, of one over east, north and yaw. The altitude is above ground, not above
+    the ellipsoid: wide."""
+    enu = np.zeros((3, 3))
+    enu[:2, :2] = covariance[:2, :2]
+    enu[2, 2] = config.sigma_up_m**2
+    return enu

@@ -96,7 +96,7 @@ def test_what_gives_no_refined_pose() -> None:
 def test_the_covariance_is_never_better_than_its_floor_and_grows_with_the_lever() -> None:
     refined = refine(coarse(1.0, 1.0, 0.1), POSES, SEEN, GROUND, DEFAULT)
     assert refined is not None
-    covariance = covariance_enu(refined, DEFAULT)
+    covariance = covariance_enu(refined.covariance, DEFAULT)
     assert np.all(np.diag(covariance)[:2] == DEFAULT.sigma_floor_m**2)
     assert covariance[2, 2] == DEFAULT.sigma_up_m**2 and np.count_nonzero(covariance) == 3
     square = np.array([[-10.0, -10.0], [10.0, -10.0], [10.0, 10.0], [-10.0, 10.0]])
