@@ -88,12 +88,14 @@ class Mapper:
         T_new_old = None  # noqa: N806
         if before is not None and before in graph.poses:
             T_new_old = graph.poses[keyframe].inverse().compose(graph.poses[before])  # noqa: N806
+        update = self._update(keyframe, started)
+        # Only now: whoever is told of a frame tracked in this keyframe is to know the keyframe.
         self._tracker.rebase(frame.stamp_ns, self._atlas.prepared(keyframe), T_new_old)
-        return self._update(keyframe, started)
+        return update
 
     def track(self, frame: Frame) -> Tracked | Lost:
-        """Where a frame between keyframes is, in the latest keyframe of the map. Raises WireError for
-        unusable telemetry."""
+        """Where a frame between keyframes is, in the latest keyframe of the map; may run while a keyframe is
+        added on another thread. Raises WireError for unusable telemetry."""
         return self._tracker.track(frame)
 
     def finish(self) -> MapUpdate | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass, replace
 
 from buildloc_msgs_py.ground import validate_frame
@@ -58,20 +59,27 @@ class Tracker:
 
     def reset(self) -> None:
         """Forget the flight."""
+        self._rebases: deque[tuple[_Base, Similarity | None]] = deque()
         self._base: _Base | None = None
         self._motion: _Motion | None = None
 
     def rebase(self, stamp_ns: int, prepared: Prepared, T_new_old: Similarity | None) -> None:  # noqa: N803
-        """Track against another keyframe, in which the one before lies at ``T_new_old``; None: unknown."""
-        self._base = _Base(stamp_ns, prepared)
-        if self._motion is not None and T_new_old is not None:
-            self._motion = replace(self._motion, pose=T_new_old.compose(self._motion.pose))
-        else:
-            self._motion = None
+        """Track against another keyframe from the next frame on, in which the one before lies at
+        ``T_new_old``; None: unknown. It may come from another thread than :meth:`track`."""
+        self._rebases.append((_Base(stamp_ns, prepared), T_new_old))
+
+    def _take_over(self) -> None:
+        while self._rebases:
+            self._base, T_new_old = self._rebases.popleft()  # noqa: N806
+            if self._motion is not None and T_new_old is not None:
+                self._motion = replace(self._motion, pose=T_new_old.compose(self._motion.pose))
+            else:
+                self._motion = None
 
     def track(self, frame: Frame) -> Tracked | Lost:
         """Where a frame is. Raises WireError for unusable telemetry."""
         validate_frame(frame)
+        self._take_over()
         if (base := self._base) is None:
             return Lost(frame.stamp_ns, "no_keyframe")
         link = self._follow(base, frame)
