@@ -413,15 +413,17 @@ def _replay(args: argparse.Namespace) -> int:
         fixes = args.out or Path(folder) / "fixes.jsonl"
         played = replay(args.bag, None if args.no_nodes else settings, args.rate, Path(folder), fixes)
         results = read_fixes(fixes)
-    report = played.report
+    report, telling = played.report, Digest()
     accepted = [result for result in results if isinstance(result, Fix)]
     for result in accepted:
-        print(describe(result))
+        if telling.worth(result):
+            print(describe(result))
     print(
         f"{len(accepted)} fixes received on /buildloc/fix; {report.images} images, {report.dropped} dropped, "
         f"{report.frames_unusable} unusable, {report.keyframes} keyframes, {report.keyframes_lost} lost, "
         f"{report.maps} maps, {report.maps_skipped} overtaken; {report.seconds:.1f} s"
     )
+    print(played.timing.line())
     return 0
 
 
