@@ -7,7 +7,6 @@ leaves open: disagreement. In between nothing is decided, as over open country.
 
 from __future__ import annotations
 
-import enum
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ import numpy as np
 from buildloc_msgs_py.types import FloatArray, FrameObservation
 from scipy.special import logsumexp
 
+from buildloc_matcher.acceptance import Outcome
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.evidence import GATE_SIGMAS, Ground, placed_evidence
 from buildloc_matcher.geometry import rotation
@@ -25,17 +25,10 @@ SIGMAS = 3.0  # the uncertainty of a prediction reaches this far
 ONE_BUILDING_M = 6.0  # buildings of two frames nearer than this are the same
 
 
-class Outcome(enum.Enum):
-    """What the reference says about a predicted place."""
-
-    AGREED = "agreed"
-    UNDECIDED = "undecided"
-    DISAGREED = "disagreed"
-
-
 @dataclass(frozen=True)
 class Opinion:
-    """An outcome with its reason, and the nats behind it: of the pose itself, and its lead over others."""
+    """Accepted, undecided or rejected, why, and the nats behind it: of the pose itself, and its lead over
+    others."""
 
     outcome: Outcome
     reason: str
@@ -87,9 +80,9 @@ def ask(
         return Opinion(outcome, reason, nats, lead)
 
     if somewhere <= -config.follow_nats:
-        return opinion(Outcome.DISAGREED, f"the reference has not what was seen: {told}")
+        return opinion(Outcome.REJECTED, f"the reference has not what was seen: {told}")
     if lead <= -config.follow_nats and rival - chances >= config.follow_nats:
-        return opinion(Outcome.DISAGREED, f"another place near by fits better: {told}, lead {lead:.1f}")
+        return opinion(Outcome.REJECTED, f"another place near by fits better: {told}, lead {lead:.1f}")
     if lead >= config.follow_nats and nats - chances >= config.follow_nats:
-        return opinion(Outcome.AGREED, told)
+        return opinion(Outcome.ACCEPTED, told)
     return opinion(Outcome.UNDECIDED, f"the reference could not tell: {told}, lead {lead:.1f}")

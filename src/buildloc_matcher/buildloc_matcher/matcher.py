@@ -22,7 +22,7 @@ from buildloc_matcher.acceptance import (
 )
 from buildloc_matcher.config import MatcherConfig, check_matcher
 from buildloc_matcher.evidence import QueryMap, query_map, seed_evidence
-from buildloc_matcher.follow import Opinion, Outcome, ask, seen_in_world
+from buildloc_matcher.follow import Opinion, ask, seen_in_world
 from buildloc_matcher.geometry import Similarity, wrap
 from buildloc_matcher.hypotheses import hypothesize
 from buildloc_matcher.local_map import check_map
@@ -269,14 +269,14 @@ class Matcher:
         offset[2] = wrap(offset[2])
         seen = seen_in_world(poses, observations, config.follow_frames)
         opinion = ask(seen, offset[:2], covariance, reference, config)
-        if refined is None or opinion.outcome is not Outcome.AGREED:
+        if refined is None or opinion.outcome is not Outcome.ACCEPTED:
             return Followed(opinion, None)
         if (refused := refuse_refined(refined, config)) is not None:
             return Followed(replace(opinion, outcome=Outcome.UNDECIDED, reason=refused), None)
         apart = sigmas_apart(offset, covariance + refined.covariance)
         if apart > config.max_jump_sigmas:
             jump = f"the place jumped by {math.hypot(*offset[:2]):.1f} m, {apart:.1f} standard deviations"
-            return Followed(replace(opinion, outcome=Outcome.DISAGREED, reason=jump), None)
+            return Followed(replace(opinion, outcome=Outcome.REJECTED, reason=jump), None)
         return Followed(opinion, Agreement(poses, refined.covariance, predicted.scale))
 
 

@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 from buildloc_msgs_py.types import Fix, FrameObservation, Keyframe, LocalMap, NoFix, Tracked
 
-from buildloc_matcher.follow import Outcome
+from buildloc_matcher.acceptance import Outcome
 from buildloc_matcher.geometry import wrap
 from buildloc_matcher.matcher import Answer, Matcher
 from buildloc_matcher.pursuit import (
@@ -128,7 +128,7 @@ class Seeker:
         followed = matcher.follow(prediction(anchor, last), uncertainty, keyframes, observations)
         opinion, agreement = followed.opinion, followed.agreement
         funnel = {"follow_nats": opinion.nats, "follow_lead": opinion.lead}
-        if opinion.outcome is Outcome.DISAGREED:
+        if opinion.outcome is Outcome.REJECTED:
             none = NoFix(last.stamp_ns, opinion.reason)
             return Answer(none, (), funnel), partial(withdraw, reason=opinion.reason)
         place, step = Place(last.stamp_ns, anchor.x_m, anchor.y_m, anchor.yaw_rad, uncertainty), coast

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from buildloc_matcher.follow import Outcome, ask, seen_in_world
+from buildloc_matcher.acceptance import Outcome
+from buildloc_matcher.follow import ask, seen_in_world
 from buildloc_matcher.geometry import Similarity, rotation, wrap
 from buildloc_matcher.matcher import Followed, Matcher
 from buildloc_msgs_py.types import FloatArray, FrameObservation, Keyframe
@@ -51,7 +52,7 @@ def follow(seen: Buildings, east_m: float = 0.0, north_m: float = 0.0, spread: F
 
 def test_the_reference_agrees_with_what_is_there_and_corrects_it() -> None:
     followed = follow(TOWN, 2.0, -1.5)
-    assert followed.opinion.outcome is Outcome.AGREED and followed.agreement is not None
+    assert followed.opinion.outcome is Outcome.ACCEPTED and followed.agreement is not None
     assert followed.opinion.nats > 20.0 and followed.opinion.lead > 20.0
     x, y, yaw = followed.agreement.poses[STEPS - 1]
     # Errors of 0.5 m in some twenty buildings, and lever arms.
@@ -68,14 +69,14 @@ def test_without_buildings_nothing_is_decided() -> None:
 
 def test_buildings_that_the_reference_does_not_have_disagree() -> None:
     followed = follow(town(102, 6000, 2400.0))
-    assert followed.opinion.outcome is Outcome.DISAGREED and followed.agreement is None
+    assert followed.opinion.outcome is Outcome.REJECTED and followed.agreement is None
     assert "has not what was seen" in followed.opinion.reason
 
 
 def test_a_correction_beyond_the_uncertainty_is_a_jump() -> None:
     strict = Matcher(MATCHER.database, replace(DEFAULT, max_jump_sigmas=2.0))
     followed = strict.follow(predicted(9.0, 0.0), np.diag([0.01, 0.01, 1e-6]), KEYFRAMES, frames(TOWN))
-    assert followed.opinion.outcome is Outcome.DISAGREED and followed.agreement is None
+    assert followed.opinion.outcome is Outcome.REJECTED and followed.agreement is None
     assert "the place jumped by" in followed.opinion.reason
 
 
@@ -85,7 +86,7 @@ def test_a_street_grid_that_fits_next_door_decides_nothing_once_the_next_door_is
     middle = grid.centroids_m.mean(axis=0)
     near = grid.centroids_m[np.abs(grid.centroids_m - middle).max(axis=1) < 60.0]
     here, none = np.asarray(near), np.zeros(2)
-    assert ask(here, none, SURE, reference, DEFAULT).outcome is Outcome.AGREED
+    assert ask(here, none, SURE, reference, DEFAULT).outcome is Outcome.ACCEPTED
     wide = np.diag([100.0, 100.0, 1e-4])  # 30 m at three sigma: the neighbour is 24 m away
     opinion = ask(here, none, wide, reference, DEFAULT)
     assert opinion.outcome is Outcome.UNDECIDED and opinion.lead < 2.0
@@ -95,7 +96,7 @@ def test_a_better_place_within_the_uncertainty_is_a_disagreement() -> None:
     seen = seen_in_world({k.stamp_ns: _pose(k) for k in KEYFRAMES}, frames(TOWN), 8)
     wide, away = np.diag([100.0, 100.0, 1e-4]), np.array([15.0, 0.0])
     opinion = ask(seen + away, away, wide, MATCHER.database.ground, DEFAULT)
-    assert opinion.outcome is Outcome.DISAGREED and "near by fits better" in opinion.reason
+    assert opinion.outcome is Outcome.REJECTED and "near by fits better" in opinion.reason
 
 
 def _pose(keyframe: Keyframe) -> tuple[float, float, float]:

@@ -8,8 +8,9 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from buildloc_matcher.acceptance import Outcome
 from buildloc_matcher.config import MatcherConfig
-from buildloc_matcher.follow import Opinion, Outcome
+from buildloc_matcher.follow import Opinion
 from buildloc_matcher.geometry import Similarity
 from buildloc_matcher.matcher import Answer, Followed
 from buildloc_matcher.pursuit import Agreement, Mode, Place
@@ -46,7 +47,7 @@ class Scripted:
         self, predicted: Similarity, _: FloatArray, keyframes: Sequence[Keyframe], __: object
     ) -> Followed:
         outcome, last = self.outcomes.popleft(), keyframes[-1]
-        if outcome is not Outcome.AGREED:
+        if outcome is not Outcome.ACCEPTED:
             return Followed(Opinion(outcome, f"said {outcome.value}", 0.0, 0.0), None)
         x, y = predicted.apply(np.array([[last.x_m, last.y_m]]))[0].tolist()
         agreement = Agreement({last.stamp_ns: (x, y, last.yaw_rad)}, SPREAD, predicted.scale)
@@ -93,7 +94,7 @@ def test_it_searches_until_it_finds_and_follows_from_then_on(matcher: Scripted, 
     here = seeker.locate(frame(2, 5.0))
     assert isinstance(here, Fix) and (here.easting_m, here.northing_m) == pytest.approx((505.0, 700.0))
     assert (here.stamp_ns, here.altitude_m) == (2 * SECOND + 1, 91.0)
-    matcher.outcomes.append(Outcome.AGREED)
+    matcher.outcomes.append(Outcome.ACCEPTED)
     followed = at_keyframe(seeker, 3)
     assert isinstance(followed, Fix) and (followed.easting_m, followed.altitude_m) == (530.0, 90.0)
     assert matcher.searches == 2 and seeker.withdrawals == 0
@@ -115,12 +116,12 @@ def test_undecided_coasts_with_a_growing_uncertainty_until_it_is_withdrawn(
 
 def test_disagreement_withdraws_and_the_search_begins_again(matcher: Scripted, seeker: Seeker) -> None:
     matcher.places += [(500.0, 700.0), (800.0, 700.0)]
-    matcher.outcomes.append(Outcome.DISAGREED)
+    matcher.outcomes.append(Outcome.REJECTED)
     at_keyframe(seeker, 1)
-    assert at_keyframe(seeker, 2) == NoFix(2 * SECOND, "said disagreed")
+    assert at_keyframe(seeker, 2) == NoFix(2 * SECOND, "said rejected")
     assert seeker.pursuit.mode is Mode.ACQUIRE and seeker.withdrawals == 1
-    assert seeker.reason == seeker.pursuit.withdrawn == "said disagreed"
-    assert seeker.locate(frame(2, 5.0)) == NoFix(2 * SECOND + 1, "said disagreed")
+    assert seeker.reason == seeker.pursuit.withdrawn == "said rejected"
+    assert seeker.locate(frame(2, 5.0)) == NoFix(2 * SECOND + 1, "said rejected")
     found = at_keyframe(seeker, 3)
     assert isinstance(found, Fix) and found.easting_m == 800.0
 
@@ -130,7 +131,7 @@ def test_now_and_then_the_global_search_has_to_confirm(matcher: Scripted) -> Non
     seeker = Seeker(matcher)  # type: ignore[arg-type]
     # Confirmed at keyframe 3, not found at 5, which says nothing, and elsewhere at 7.
     matcher.places += [(500.0, 700.0), (561.0, 700.0), None, (900.0, 700.0)]
-    matcher.outcomes += [Outcome.AGREED] * 5
+    matcher.outcomes += [Outcome.ACCEPTED] * 5
     fixes = [at_keyframe(seeker, number) for number in range(1, 8)]
     assert all(isinstance(fix, Fix) for fix in fixes[:6]) and matcher.searches == 4
     assert isinstance(fixes[6], NoFix) and "another place, 220.0 m away" in fixes[6].reason
