@@ -102,6 +102,26 @@ class MatcherConfig:
     min_pairs: int = param(10, "fewest distinct reference buildings matched for a fix", 3, 100000)
     max_residual_m: float = param(10.0, "largest RMS distance of the matched pairs for a fix, m", 0.1, 1000.0)
     sigma_up_m: float = param(100.0, "standard deviation reported for the altitude, m", 0.1, 10000.0)
+    follow_frames: int = param(4, "latest keyframes whose buildings agree with the reference or not", 1, 100)
+    follow_nats: float = param(
+        7.0, "evidence that decides for or against a predicted place, nats; less decides nothing", 0.1, 1e3
+    )
+    max_jump_sigmas: float = param(
+        5.0, "farthest that an agreement may lie from the prediction, standard deviations", 1.0, 100.0
+    )
+    drift_share: float = param(
+        0.02, "standard deviation of a place carried on without an agreement, over the distance", 0.0, 1.0
+    )
+    drift_deg_per_km: float = param(3.0, "the same of the heading, deg per km", 0.0, 1000.0)
+    max_coast_m: float = param(
+        300.0, "distance without an agreement after which a place is withdrawn, m", 1.0, 1e5
+    )
+    max_track_sigma_m: float = param(
+        15.0, "standard deviation without an agreement at which a place is withdrawn, m", 0.1, 1000.0
+    )
+    check_keyframes: int = param(
+        6, "keyframes from one global search to the next while tracking, which must confirm", 1, 10000
+    )
 
 
 DEFAULT = "default"

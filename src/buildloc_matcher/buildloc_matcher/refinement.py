@@ -175,9 +175,10 @@ def horizontal_variance(
     return variance + config.sigma_registration_m**2
 
 
-def covariance_enu(refined: Refined, config: MatcherConfig) -> FloatArray:
-    """(3, 3) m2, east, north, up. The altitude is above ground, not above the ellipsoid: wide."""
+def covariance_enu(pose_covariance: FloatArray, config: MatcherConfig) -> FloatArray:
+    """(3, 3) m2, east, north, up, from that over east, north and yaw. The altitude is above ground, not
+    above the ellipsoid: wide."""
     covariance = np.zeros((3, 3))
-    covariance[:2, :2] = refined.covariance[:2, :2]
+    covariance[:2, :2] = pose_covariance[:2, :2]
     covariance[2, 2] = config.sigma_up_m**2
     return covariance

@@ -104,7 +104,7 @@ def test_the_covariance_counts_the_registration_of_the_reference() -> None:
     exact = refined_of(refine(begun, POSES, SEEN, GROUND, registered))
     refined = refined_of(refine(begun, POSES, SEEN, GROUND, DEFAULT))
     np.testing.assert_allclose(refined.covariance - exact.covariance, np.diag([2.25, 2.25, 0.0]), atol=1e-12)
-    covariance = covariance_enu(refined, DEFAULT)
+    covariance = covariance_enu(refined.covariance, DEFAULT)
     np.testing.assert_array_equal(covariance[:2, :2], refined.covariance[:2, :2])
     assert covariance[2, 2] == DEFAULT.sigma_up_m**2 and not covariance[2, :2].any()
 

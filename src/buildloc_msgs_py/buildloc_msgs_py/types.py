@@ -72,6 +72,24 @@ class Keyframe:
 
 
 @dataclass(frozen=True)
+class Tracked:
+    """Where a frame is in a keyframe: below the camera, in the level camera frame of the keyframe.
+
+    Metres are those of the keyframe's altimeter; its scale in the map is not in them, ``height_m`` above
+    ground included. ``covariance`` (4, 4) is that of the registration alone, over x, y, yaw and the
+    logarithm of the height.
+    """
+
+    stamp_ns: int
+    keyframe_ns: int
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    height_m: float
+    covariance: FloatArray
+
+
+@dataclass(frozen=True)
 class LocalMap:
     """Buildings seen so far in ``buildloc_map`` (metric, y up, arbitrary origin and heading).
 
