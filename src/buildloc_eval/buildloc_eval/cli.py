@@ -53,6 +53,12 @@ def _level(text: str) -> int | Literal["measured"]:
     return int(text)
 
 
+def _count(text: str) -> int:
+    if not (text.isdecimal() and int(text) > 0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above zero")
+    return int(text)
+
+
 def _progress(done: int, total: int) -> None:
     if sys.stderr.isatty():
         print(f"\r{done}/{total} images", end="\n" if done == total else "", file=sys.stderr, flush=True)
@@ -152,7 +158,9 @@ def run_demo(args: argparse.Namespace) -> int:
 def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `buildloc eval`."""
     parser.add_argument(
-        "name", choices=["barnarp", "mapping", "paper", "scale", "segmentation"], help="which evaluation"
+        "name",
+        choices=["barnarp", "integrity", "mapping", "paper", "scale", "segmentation"],
+        help="which evaluation",
     )
     parser.add_argument(
         "-o", "--out", type=Path, required=True, help="folder for report.json and report.html"
@@ -163,6 +171,12 @@ def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
         "--levels", nargs="+", type=_level, metavar="LEVEL",
         help="levels of the maps' errors: numbers, or `measured` on the segmenter (default: 1 2 3)",
     )  # fmt: skip
+    group = parser.add_argument_group("eval integrity")
+    group.add_argument(
+        "--plan", choices=["test", "calibration"],
+        help="ground and seeds: the test's (default), or those that acceptance is calibrated on",
+    )  # fmt: skip
+    group.add_argument("--trials", type=_count, metavar="N", help="how many (default: 30000, quick: 400)")
     group = parser.add_argument_group("eval segmentation")
     group.add_argument(
         "--case", action="append", default=[], metavar="PLACE=MODEL", dest="cases",
@@ -194,11 +208,18 @@ def run_eval(args: argparse.Namespace) -> int:
         )
     if args.name != "scale" and args.levels:
         raise BuildlocError(f"--levels is of `eval scale`, not of `eval {args.name}`")
+    if args.name != "integrity" and (args.plan or args.trials):
+        raise BuildlocError(f"--plan and --trials are of `eval integrity`, not of `eval {args.name}`")
     if args.name == "scale":
         from buildloc_eval import scale
 
         levels = None if args.levels is None else tuple(args.levels)
         print(scale.evaluate(args.out, args.seed, args.quick, _stage, levels))
+    elif args.name == "integrity":
+        from buildloc_eval.integrity import evaluate as integrity
+
+        trials = args.trials or (integrity.QUICK_TRIALS if args.quick else integrity.TRIALS)
+        print(integrity.evaluate(args.out, args.plan or "test", trials, args.seed, _stage))
     elif args.name == "mapping":
         from buildloc_eval import mapping
 
