@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from buildloc_matcher.acceptance import Verdict
 from buildloc_matcher.config import MatcherConfig, matcher_config
 from buildloc_matcher.matcher import Matcher, MatchResult
 from buildloc_matcher.reference.database import ReferenceDatabase
@@ -96,8 +97,8 @@ def run(number: int, grounds: Grounds) -> Record:
     record = _told(one, tried)
     record |= {"observe_s": flown - started, "seconds": answered - flown}
     record["cpu_s"] = time.process_time() - worked
-    record |= _judged(matcher, matcher.found, answer.result)
-    record |= _candidates(matcher, matcher.found)
+    record |= _judged(matcher.judge(matcher.found), answer.result)
+    record |= _candidates(matcher.found)
     record["best_error_m"] = _best_error(one, matcher, matcher.found, tried)
     record |= {f"funnel.{name}": value for name, value in answer.funnel.items()}
     record |= _fix(one, answer.result, tried)
@@ -117,23 +118,16 @@ def _told(one: Trial, tried: Attempt) -> Record:
     }  # fmt: skip
 
 
-def _judged(matcher: Matcher, found: MatchResult, result: Fix | NoFix) -> Record:
-    """Outcome and score: the one place that knows how the matcher decides.
-
-    The score is the lesser of log-odds and lead, nats, which stand at the same threshold.
-    """
-    refused = matcher.refuse(found)
-    score = min(found.funnel.get("log_odds", -math.inf), found.funnel.get("lead", -math.inf))
+def _judged(verdict: Verdict, result: Fix | NoFix) -> Record:
+    """What the search was judged to be worth, and whether that became a fix: refinement may refuse."""
     return {
-        "fixed": isinstance(result, Fix),
+        "outcome": str(verdict.outcome), "score": verdict.score,
+        "false_fix_probability": verdict.false_fix_probability, "fixed": isinstance(result, Fix),
         "reason": result.reason if isinstance(result, NoFix) else "",
-        "search_refused": refused is not None,
-        "score": score,
-        "false_fix_probability": math.nan,
-    }
+    }  # fmt: skip
 
 
-def _candidates(matcher: Matcher, found: MatchResult) -> Record:
+def _candidates(found: MatchResult) -> Record:
     """Figures of the ranked candidates, best first; lists."""
     listed, scores = found.candidates, found.scores
     return {
