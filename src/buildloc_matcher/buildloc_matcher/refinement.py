@@ -175,10 +175,10 @@ def horizontal_variance(
     return variance + config.sigma_registration_m**2
 
 
-def covariance_enu(covariance: FloatArray, config: MatcherConfig) -> FloatArray:
-    """(3, 3) m2, east, north, up, of one over east, north and yaw. The altitude is above ground, not above
-    the ellipsoid: wide."""
-    enu = np.zeros((3, 3))
-    enu[:2, :2] = covariance[:2, :2]
-    enu[2, 2] = config.sigma_up_m**2
-    return enu
+def covariance_enu(pose_covariance: FloatArray, config: MatcherConfig) -> FloatArray:
+    """(3, 3) m2, east, north, up, from that over east, north and yaw. The altitude is above ground, not
+    above the ellipsoid: wide."""
+    covariance = np.zeros((3, 3))
+    covariance[:2, :2] = pose_covariance[:2, :2]
+    covariance[2, 2] = config.sigma_up_m**2
+    return covariance
