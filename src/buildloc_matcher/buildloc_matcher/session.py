@@ -129,6 +129,16 @@ class Session:
             return NoFix(tracked.stamp_ns, self.reason)
         return self.seeker.locate(tracked)
 
+    def failed(self, reason: str) -> None:
+        """A job had no answer at all, and why."""
+        if self.seeker is not None:
+            self.seeker.reason = reason
+
+    def figures(self) -> dict[str, object]:
+        """For /diagnostics."""
+        counts = {"frames_unusable": self.frames_unusable, "maps_skipped": self.maps_skipped}
+        return {"database": self.database_path} | counts | (self.seeker.figures() if self.seeker else {})
+
     def waiting(self) -> NoFix:
         """No position right now, at the capture time of the latest image."""
         missing = self.telemetry.missing()
