@@ -48,6 +48,8 @@ IMAGERY = [
     "Boston (OpenStreetMap) that they are set into as the reference",
     "simulated: the flights and the camera that photographs the orthophotos, its telemetry; and that Barnarp "
     "and Banepa lie in Boston, where the seed says",
+    "the outlines were drawn on the very images that are flown over: the errors in metres are without what "
+    "another survey's georeference would add",
 ]
 FOUND_M = 5.0  # from a reference's building to one of the map that is the same
 
