@@ -53,6 +53,12 @@ def _level(text: str) -> int | Literal["measured"]:
     return int(text)
 
 
+def _count(text: str) -> int:
+    if not (text.isdecimal() and int(text) > 0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above zero")
+    return int(text)
+
+
 def _progress(done: int, total: int) -> None:
     if sys.stderr.isatty():
         print(f"\r{done}/{total} images", end="\n" if done == total else "", file=sys.stderr, flush=True)
@@ -153,7 +159,7 @@ def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `buildloc eval`."""
     parser.add_argument(
         "name",
-        choices=["barnarp", "beyond", "mapping", "paper", "scale", "segmentation"],
+        choices=["barnarp", "beyond", "integrity", "mapping", "paper", "scale", "segmentation"],
         help="which evaluation",
     )
     parser.add_argument(
@@ -176,6 +182,12 @@ def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
         "--model", action="append", default=[], metavar="PLACE=MODEL", dest="models",
         help="ONNX network for real imagery of a place that it never saw; repeatable (default: shipped one)",
     )  # fmt: skip
+    group = parser.add_argument_group("eval integrity")
+    group.add_argument(
+        "--plan", choices=["test", "calibration"],
+        help="ground and seeds: the test's (default), or those that acceptance is calibrated on",
+    )  # fmt: skip
+    group.add_argument("--trials", type=_count, metavar="N", help="how many (default: 30000, quick: 400)")
     group = parser.add_argument_group("eval segmentation")
     group.add_argument(
         "--case", action="append", default=[], metavar="PLACE=MODEL", dest="cases",
@@ -209,6 +221,8 @@ def run_eval(args: argparse.Namespace) -> int:
         raise BuildlocError(f"--levels is of `eval scale`, not of `eval {args.name}`")
     if args.name != "paper" and (args.parts or args.models):
         raise BuildlocError(f"--parts and --model are of `eval paper`, not of `eval {args.name}`")
+    if args.name != "integrity" and (args.plan or args.trials):
+        raise BuildlocError(f"--plan and --trials are of `eval integrity`, not of `eval {args.name}`")
     if args.name == "scale":
         from buildloc_eval import scale
 
@@ -218,6 +232,11 @@ def run_eval(args: argparse.Namespace) -> int:
         from buildloc_eval.beyond import evaluate as beyond
 
         print(beyond.evaluate(args.out, args.seed, args.quick, _stage))
+    elif args.name == "integrity":
+        from buildloc_eval.integrity import evaluate as integrity
+
+        trials = args.trials or (integrity.QUICK_TRIALS if args.quick else integrity.TRIALS)
+        print(integrity.evaluate(args.out, args.plan or "test", trials, args.seed, _stage))
     elif args.name == "mapping":
         from buildloc_eval import mapping
 

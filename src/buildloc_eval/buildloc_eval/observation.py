@@ -15,6 +15,7 @@ import numpy as np
 from buildloc_matcher.reference.buildings import Buildings
 from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.types import FloatArray, LocalMap
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from buildloc_eval.segmentation_errors import read_errors
@@ -118,14 +119,12 @@ def fly_path(start_m: FloatArray, rng: np.random.Generator) -> FloatArray:
     return np.asarray(start_m + along)
 
 
-def _bend(path_m: FloatArray, model: Sensing, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+def bend(path_m: FloatArray, model: Sensing, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """The path as a drifting map has it, and the heading error (P,) along it."""
     sigma = math.radians(model.heading_walk_deg) * math.sqrt(STEP_M / 10.0)
     drift = np.cumsum(rng.normal(0.0, sigma, len(path_m)))
     moves = np.diff(path_m, axis=0, prepend=path_m[:1])
-    c, s = np.cos(drift), np.sin(drift)
-    turned = np.column_stack([c * moves[:, 0] - s * moves[:, 1], s * moves[:, 0] + c * moves[:, 1]])
-    return np.cumsum(turned, axis=0), drift
+    return np.cumsum(turned(moves, drift), axis=0), drift
 
 
 def observe_map(
@@ -149,7 +148,17 @@ def observe_map(
     raise ObservationError(f"no flight of {LONGEST_PATH_M:g} m meets {count} buildings; ask for fewer")
 
 
-def _observe_along(
+@dataclass(frozen=True)
+class Met:
+    """The first buildings of the map along a path: true places (N, 2) in the reference's frame, rows (N,) of
+    the building whose size and shape each has, steps (N,) of the path where it is passed."""
+
+    true_m: FloatArray
+    source: NDArray[np.int64]
+    along: NDArray[np.int64]
+
+
+def met_along(
     reference: Buildings,
     tree: cKDTree,
     path: FloatArray,
@@ -157,7 +166,8 @@ def _observe_along(
     model: Sensing,
     rng: np.random.Generator,
     digitiser: Digitiser,
-) -> ObservedMap | None:
+) -> Met | None:
+    """Who a map of ``count`` buildings is made of; None where the path leads over too few."""
     near = np.unique(np.concatenate(tree.query_ball_point(path[::10], HALF_SWATH_M + 10 * STEP_M))).astype(
         int
     )
@@ -181,26 +191,56 @@ def _observe_along(
     source = np.concatenate([rows, rows[like]])
     along = np.concatenate([along, extra_at])
     first = np.sort(np.argsort(along, kind="stable")[:count])
-    true, source, along = true[first], source[first], along[first]
-    bent, drift = _bend(path, model, rng)
-    offset = true - path[along]
-    c, s = np.cos(drift[along]), np.sin(drift[along])
-    placed = bent[along] + np.column_stack(
-        [c * offset[:, 0] - s * offset[:, 1], s * offset[:, 0] + c * offset[:, 1]]
-    )
+    return Met(true[first], source[first], along[first])
+
+
+def _observe_along(
+    reference: Buildings,
+    tree: cKDTree,
+    path: FloatArray,
+    count: int,
+    model: Sensing,
+    rng: np.random.Generator,
+    digitiser: Digitiser,
+) -> ObservedMap | None:
+    met = met_along(reference, tree, path, count, model, rng, digitiser)
+    if met is None:
+        return None
+    true, along = met.true_m, met.along
+    bent, drift = bend(path, model, rng)
+    placed = bent[along] + turned(true - path[along], drift[along])
     placed += rng.normal(0.0, model.jitter_m, placed.shape)
     yaw, scale = rng.uniform(-math.pi, math.pi), 1.0 + rng.normal(0.0, model.scale_sigma)
-    turn = scale * np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
-    local = (placed - placed[0]) @ turn.T
+    local = scale * turned(placed - placed[0], yaw)
+    areas, shapes = measured(reference, met.source, scale, model, digitiser, rng)
+    ids = np.arange(count, dtype=np.int64)
+    local_map = LocalMap.whole(0, ids, local, areas, shapes, np.ones_like(ids))
+    return ObservedMap(local_map, true, float(along.max()) * STEP_M)
+
+
+def turned(vectors: FloatArray, angle_rad: FloatArray | float) -> FloatArray:
+    """Vectors (N, 2) turned counter-clockwise, by an angle (N,) each or by one."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return np.column_stack([c * vectors[:, 0] - s * vectors[:, 1], s * vectors[:, 0] + c * vectors[:, 1]])
+
+
+def measured(
+    reference: Buildings,
+    source: NDArray[np.int64],
+    scale: float,
+    model: Sensing,
+    digitiser: Digitiser,
+    rng: np.random.Generator,
+) -> tuple[FloatArray, FloatArray]:
+    """Areas (N,) m2 and shapes (N, 4) that a map of this scale has of the buildings of these rows."""
+    count = len(source)
     log_area_sigma = math.hypot(digitiser.log_area_sigma, model.log_area_sigma)
     log_areas = rng.normal(0.0, log_area_sigma, count) + model.log_area_bias
     areas = reference.areas_m2[source] * np.exp(log_areas) * scale**2
     noisy = reference.shapes[source] + rng.normal(
         0.0, np.hypot(digitiser.shape_sigma, model.shape_sigma), (count, 4)
     )
-    ids = np.arange(count, dtype=np.int64)
-    local_map = LocalMap.whole(0, ids, local, areas, np.clip(noisy, 0.05, 1.0), np.ones_like(ids))
-    return ObservedMap(local_map, true, float(along.max()) * STEP_M)
+    return np.asarray(areas, dtype=np.float64), np.clip(noisy, 0.05, 1.0)
 
 
 def digitising_offsets(count: int, digitiser: Digitiser, rng: np.random.Generator) -> FloatArray:

@@ -11,7 +11,7 @@ from buildloc_matcher.config import matcher_config
 from buildloc_matcher.matcher import Matcher, MatchResult
 from buildloc_matcher.reference.buildings import Buildings
 from buildloc_matcher.reference.database import ReferenceDatabase, assemble
-from buildloc_matcher.refinement import refine
+from buildloc_matcher.refinement import Refined, refine
 from buildloc_matcher.session import frames_kept
 from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.types import FloatArray
@@ -124,7 +124,7 @@ def _refined(
     coarse = matcher.place(found, np.array([last.x_m, last.y_m]))
     seen = maps.observations[:keyframes][-frames_kept(matcher.config) :]
     refined = refine(coarse, snapshot.keyframes, seen, matcher.database.ground, matcher.config)
-    return None if refined is None else refined.position_m
+    return refined.position_m if isinstance(refined, Refined) else None
 
 
 def brm_survivors(reference: brm.RatioMap, maps: Maps) -> tuple[brm.Survivors, float]:

@@ -1,0 +1,1 @@
+"""`buildloc eval integrity`: a Monte-Carlo of flights without images, negative controls among them."""

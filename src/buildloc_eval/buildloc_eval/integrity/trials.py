@@ -1,0 +1,192 @@
+"""One trial: a flight, what the matcher answers, and how that compares with the truth."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from buildloc_matcher.acceptance import Verdict
+from buildloc_matcher.config import MatcherConfig, matcher_config
+from buildloc_matcher.matcher import Matcher, MatchResult
+from buildloc_matcher.reference.database import ReferenceDatabase
+from buildloc_msgs_py.types import Fix, FloatArray, LocalMap, NoFix
+
+from buildloc_eval.integrity.grounds import Grounds
+from buildloc_eval.integrity.plan import TOWN_NONE, Place, Plan, Trial, shift_of, streams, trial
+from buildloc_eval.observation import Digitiser, sensing
+from buildloc_eval.observed_flight import Flown, ObservedFlight, mirrored, observe_flight, scaled
+
+Record = dict[str, Any]
+# Where world and reference are two real sources, nothing is added to how they differ.
+NOTHING = Digitiser(0.0, 0.0, 1e-9, 0.0, 0.0, (0.0, 0.0, 0.0, 0.0))
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """A flight against a reference; the truth (2,) m, moved by the reference's shift."""
+
+    flight: ObservedFlight
+    database: ReferenceDatabase
+    truth_m: FloatArray
+
+
+class RecordingMatcher(Matcher):
+    """A matcher that keeps what its last search found: a fix tells less."""
+
+    found: MatchResult
+
+    def locate(self, local_map: LocalMap) -> MatchResult:
+        """As the matcher's."""
+        self.found = super().locate(local_map)
+        return self.found
+
+
+def other_city(plan: Plan, place: Place) -> Place:
+    """The next place of the plan that is in another city."""
+    first = plan.places.index(place)
+    around = plan.places[first:] + plan.places[:first]
+    return next(other for other in around if other.city != place.city)
+
+
+def attempt(one: Trial, grounds: Grounds) -> Attempt:
+    """Fly a trial. Raises ObservationError where its ground has too few buildings."""
+    _, rng = streams(grounds.plan, grounds.seed, one.number)
+    flown, over = _ground(one, grounds)
+    model = sensing(one.level)
+    if one.kind == "snow":
+        model = replace(model, false=one.amount)
+    digitiser = Digitiser() if over.world == over.reference or one.town != TOWN_NONE else NOTHING
+    flight = observe_flight(flown, one.buildings, model, rng, digitiser)
+    if one.kind == "mirrored":
+        flight = mirrored(flight)
+    elif one.kind == "scaled":
+        flight = scaled(flight, one.amount)
+    reference = grounds.reference(one.place, one.radius_km, one.variant)
+    return Attempt(flight, reference, flight.camera_m + shift_of(one, rng))
+
+
+def _ground(one: Trial, grounds: Grounds) -> tuple[Flown, Place]:
+    """What is flown over, and the place that it is of."""
+    if one.kind == "outside":
+        return grounds.outside(one.place), one.place
+    if one.kind == "another city":
+        other = other_city(grounds.plan, one.place)
+        return grounds.home(other, other.radii_km[-1]), other
+    if one.town != TOWN_NONE:
+        return grounds.suburb(one.place, one.town), one.place
+    return grounds.home(one.place, one.radius_km), one.place
+
+
+def config_of(one: Trial) -> MatcherConfig:
+    """The default preset."""
+    return matcher_config()
+
+
+def run(number: int, grounds: Grounds) -> Record:
+    """The trial of a number and all that is kept of it."""
+    one = trial(grounds.plan, grounds.seed, number)
+    started = time.perf_counter()
+    tried = attempt(one, grounds)
+    flown, worked = time.perf_counter(), time.process_time()
+    matcher = RecordingMatcher(tried.database, config_of(one))
+    answer = matcher.fix(tried.flight.local_map, tried.flight.keyframes, tried.flight.observations)
+    answered = time.perf_counter()
+    record = _told(one, tried)
+    record |= {"observe_s": flown - started, "seconds": answered - flown}
+    record["cpu_s"] = time.process_time() - worked
+    record |= _judged(matcher.judge(matcher.found), answer.result)
+    record |= _candidates(matcher.found)
+    record["best_error_m"] = _best_error(one, matcher, matcher.found, tried)
+    record |= {f"funnel.{name}": value for name, value in answer.funnel.items()}
+    record |= _fix(one, answer.result, tried)
+    if one.paper:
+        record |= _paper(one, tried)
+    return record
+
+
+def _told(one: Trial, tried: Attempt) -> Record:
+    """What was tried."""
+    return {
+        "number": one.number, "place": one.place.name, "city": one.place.city, "kind": one.kind,
+        "detail": one.detail, "control": one.control, "absent": one.absent, "radius_km": one.radius_km,
+        "variant": one.variant, "buildings": one.buildings, "level": one.level, "shift_m": one.shift_m,
+        "reference_buildings": len(tried.database), "reference_km2": tried.database.area_m2 / 1e6,
+        "path_m": tried.flight.path_m, "keyframes": len(tried.flight.keyframes),
+    }  # fmt: skip
+
+
+def _judged(verdict: Verdict, result: Fix | NoFix) -> Record:
+    """What the search was judged to be worth, and whether that became a fix: refinement may refuse."""
+    return {
+        "outcome": str(verdict.outcome), "score": verdict.score,
+        "false_fix_probability": verdict.false_fix_probability, "fixed": isinstance(result, Fix),
+        "reason": result.reason if isinstance(result, NoFix) else "",
+    }  # fmt: skip
+
+
+def _candidates(found: MatchResult) -> Record:
+    """Figures of the ranked candidates, best first; lists."""
+    listed, scores = found.candidates, found.scores
+    return {
+        "candidate_x_m": [c.x_m for c in listed],
+        "candidate_y_m": [c.y_m for c in listed],
+        "candidate_yaw_rad": [c.yaw_rad for c in listed],
+        "candidate_scale": [c.scale for c in listed],
+        "candidate_votes": [c.votes for c in listed],
+        "candidate_jaccard": [c.mnn_jaccard for c in listed],
+        "candidate_log_odds": [c.acceptance for c in listed],
+        "candidate_pairs": [len(s.pairs) for s in scores],
+        "candidate_rms_m": [s.rms_m for s in scores],
+    }
+
+
+def _best_error(one: Trial, matcher: Matcher, found: MatchResult, tried: Attempt) -> float:
+    """Where the best candidate puts the last camera, against the truth, m; NaN without a candidate, infinite
+    where no place is right."""
+    if not found.candidates:
+        return math.nan
+    if one.absent:
+        return math.inf
+    last = tried.flight.keyframes[-1]
+    place = matcher.place(found, np.array([last.x_m, last.y_m])).apply(np.array([[last.x_m, last.y_m]]))[0]
+    return math.hypot(*(place - tried.truth_m))
+
+
+def _fix(one: Trial, result: Fix | NoFix, tried: Attempt) -> Record:
+    """Error of a fix, its covariance and normalised error squared; NaN without one."""
+    if isinstance(result, NoFix):
+        names = ("fix_error_m", "east_error_m", "north_error_m", "var_east_m2", "var_north_m2",
+                 "cov_east_north_m2", "nees", "yaw_error_rad")  # fmt: skip
+        return dict.fromkeys(names, math.nan)
+    error = np.array([result.easting_m, result.northing_m]) - tried.truth_m
+    covariance = result.covariance_enu_m2[:2, :2]
+    turn = result.yaw_rad - tried.flight.yaw_rad
+    return {
+        "fix_error_m": math.inf if one.absent else math.hypot(*error),
+        "east_error_m": error[0], "north_error_m": error[1],
+        "var_east_m2": covariance[0, 0], "var_north_m2": covariance[1, 1],
+        "cov_east_north_m2": covariance[0, 1],
+        "nees": float(error @ np.linalg.solve(covariance, error)),
+        "yaw_error_rad": math.atan2(math.sin(turn), math.cos(turn)),
+    }  # fmt: skip
+
+
+def paper_config() -> MatcherConfig:
+    """The paper's preset."""
+    return matcher_config({"preset": "paper"})
+
+
+def _paper(one: Trial, tried: Attempt) -> Record:
+    """The paper's argmax on the same map: its first candidate, whatever it is worth."""
+    started = time.perf_counter()
+    matcher = Matcher(tried.database, paper_config())
+    found = matcher.locate(tried.flight.local_map)
+    return {
+        "paper_answers": len(found.candidates) > 0,
+        "paper_jaccard": found.candidates[0].mnn_jaccard if found.candidates else math.nan,
+        "paper_error_m": _best_error(one, matcher, found, tried),
+        "paper_s": time.perf_counter() - started,
+    }
