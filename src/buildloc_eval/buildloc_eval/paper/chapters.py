@@ -18,6 +18,7 @@ from buildloc_eval.paper.plan import Models, Plan, Stores, maps_name, outlines_o
 from buildloc_eval.paper.real import RealFlight, Site, Trained
 from buildloc_eval.paper.report import (
     OURS,
+    TIMES,
     Chapter,
     Converged,
     Trial,
@@ -136,6 +137,7 @@ def told(
         f"failures of the {OURS}, one by one": failures_one_by_one(scored, OURS),
         "convergence": convergence_table(traces),
         "time of a query": runtime_table(scored, radii),
+        "times": TIMES,
         "plan": asdict(plan),
     }
 
