@@ -98,8 +98,9 @@ def run(number: int, grounds: Grounds) -> Record:
     record |= {"observe_s": flown - started, "seconds": answered - flown}
     record["cpu_s"] = time.process_time() - worked
     record |= _judged(matcher.judge(matcher.found), answer.result)
+    errors = _errors(one, matcher, matcher.found, tried)
     record |= _candidates(matcher.found)
-    record["best_error_m"] = _best_error(one, matcher, matcher.found, tried)
+    record |= {"candidate_error_m": errors, "best_error_m": errors[0] if errors else math.nan}
     record |= {f"funnel.{name}": value for name, value in answer.funnel.items()}
     record |= _fix(one, answer.result, tried)
     if one.paper:
@@ -143,16 +144,14 @@ def _candidates(found: MatchResult) -> Record:
     }
 
 
-def _best_error(one: Trial, matcher: Matcher, found: MatchResult, tried: Attempt) -> float:
-    """Where the best candidate puts the last camera, against the truth, m; NaN without a candidate, infinite
-    where no place is right."""
-    if not found.candidates:
-        return math.nan
+def _errors(one: Trial, matcher: Matcher, found: MatchResult, tried: Attempt) -> list[float]:
+    """How far from the truth each candidate puts the last camera, m; infinite where no place is right."""
     if one.absent:
-        return math.inf
+        return [math.inf] * len(found.candidates)
     last = tried.flight.keyframes[-1]
-    place = matcher.place(found, np.array([last.x_m, last.y_m])).apply(np.array([[last.x_m, last.y_m]]))[0]
-    return math.hypot(*(place - tried.truth_m))
+    at = np.array([last.x_m, last.y_m])
+    places = [matcher.place(replace(found, scores=(score,)), at).apply(at[None])[0] for score in found.scores]
+    return [math.hypot(*(place - tried.truth_m)) for place in places]
 
 
 def _fix(one: Trial, result: Fix | NoFix, tried: Attempt) -> Record:
@@ -184,9 +183,10 @@ def _paper(one: Trial, tried: Attempt) -> Record:
     started = time.perf_counter()
     matcher = Matcher(tried.database, paper_config())
     found = matcher.locate(tried.flight.local_map)
+    errors = _errors(one, matcher, found, tried)
     return {
-        "paper_answers": len(found.candidates) > 0,
-        "paper_jaccard": found.candidates[0].mnn_jaccard if found.candidates else math.nan,
-        "paper_error_m": _best_error(one, matcher, found, tried),
+        "paper_answers": len(errors) > 0,
+        "paper_jaccard": found.candidates[0].mnn_jaccard if errors else math.nan,
+        "paper_error_m": errors[0] if errors else math.nan,
         "paper_s": time.perf_counter() - started,
     }
