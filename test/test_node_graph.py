@@ -124,7 +124,7 @@ def test_a_database_that_is_refused_at_the_start_is_said(folder: Path) -> None:
 def test_bad_databases_are_refused_and_the_good_one_stays_in_use(
     graph: Graph, folder: Path, tmp_path: Path
 ) -> None:
-    used = graph.matcher.session.matcher
+    used = graph.matcher.session.seeker
     for number, (kind, text) in enumerate(BAD_DATABASES.items()):
         bad = bad_database(kind, tmp_path / f"{number}.bldb", folder / "houses.geojson")
         codes = LoadMap.Response
@@ -132,15 +132,15 @@ def test_bad_databases_are_refused_and_the_good_one_stays_in_use(
         assert graph.load(bad) == expected, kind
         graph.until(lambda text=text: graph.said(REFERENCE_DB, ERROR, text))
         graph.no_fix(count=1)
-        assert graph.uses(folder / "good.bldb") and graph.matcher.session.matcher is used
+        assert graph.uses(folder / "good.bldb") and graph.matcher.session.seeker is used
     assert graph.load(folder / "good.bldb") == LoadMap.Response.RESULT_SUCCESS
     graph.until(lambda: graph.states[REFERENCE_DB].level == OK)
 
 
 def test_a_database_that_was_built_again_is_read_again(graph: Graph, folder: Path, tmp_path: Path) -> None:
     def buildings() -> int:
-        matcher = graph.matcher.session.matcher
-        return 0 if matcher is None else len(matcher.database)
+        seeker = graph.matcher.session.seeker
+        return 0 if seeker is None else len(seeker.matcher.database)
 
     path = build_database(tmp_path / "city.bldb", folder / "houses.geojson")
     assert graph.load(path) == LoadMap.Response.RESULT_SUCCESS

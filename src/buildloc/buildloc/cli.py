@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 Run = Callable[[argparse.Namespace], int]
 EXTENSIONS = "buildloc.commands"
+TOLD_NS = 1_000_000_000
 
 
 def _location(text: str) -> tuple[float, float]:
@@ -350,20 +351,33 @@ def _run(args: argparse.Namespace) -> int:
         open_database(args.database, matcher_config), config_of(settings, SEGMENTER, SegmenterConfig),
         config_of(settings, MAPPER, MapperConfig), matcher_config,
     )  # fmt: skip
-    results: list[Fix | NoFix] = []
+    results, telling = list[Fix | NoFix](), Digest()
     for frame in _frames(args.bag):
         if isinstance(frame, FrameFault):
             results.append(NoFix(frame.stamp_ns, frame.reason))
-        elif (answer := localizer.process(frame)) is not None:
-            results.append(answer.result)
         else:
-            continue
-        print(describe(results[-1]), flush=True)
+            results.append(localizer.process(frame))
+        if telling.worth(results[-1]):
+            print(describe(results[-1]), flush=True)
     if args.out is not None:
         args.out.write_text("".join(json.dumps(record(result)) + "\n" for result in results))
     fixes = sum(isinstance(result, Fix) for result in results)
-    print(f"{fixes} fixes at {len(results)} keyframes or unusable frames")
+    print(f"{fixes} fixes at {len(results)} images")
     return 0
+
+
+class Digest:
+    """Which of many fixes, or absences of one, are worth a line: one per second, and every other reason."""
+
+    def __init__(self) -> None:
+        self._told: tuple[int, str | None] | None = None  # when, and why there was no fix
+
+    def worth(self, result: Any) -> bool:
+        """Whether the next result is."""
+        now = (result.stamp_ns, getattr(result, "reason", None))
+        due = self._told is None or now[1] != self._told[1] or now[0] - self._told[0] >= TOLD_NS
+        self._told = now if due else self._told
+        return due
 
 
 def describe(result: Any) -> str:
@@ -399,15 +413,17 @@ def _replay(args: argparse.Namespace) -> int:
         fixes = args.out or Path(folder) / "fixes.jsonl"
         played = replay(args.bag, None if args.no_nodes else settings, args.rate, Path(folder), fixes)
         results = read_fixes(fixes)
-    report = played.report
+    report, telling = played.report, Digest()
     accepted = [result for result in results if isinstance(result, Fix)]
     for result in accepted:
-        print(describe(result))
+        if telling.worth(result):
+            print(describe(result))
     print(
         f"{len(accepted)} fixes received on /buildloc/fix; {report.images} images, {report.dropped} dropped, "
         f"{report.frames_unusable} unusable, {report.keyframes} keyframes, {report.keyframes_lost} lost, "
         f"{report.maps} maps, {report.maps_skipped} overtaken; {report.seconds:.1f} s"
     )
+    print(played.timing.line())
     return 0
 
 
@@ -504,7 +520,7 @@ def parser() -> argparse.ArgumentParser:
         _command(
             commands, "run", "fixes of a bag, offline and deterministic", _run, bag, database,
             preset,
-            _argument("-o", "--out", type=Path, help="JSON lines, one per keyframe"),
+            _argument("-o", "--out", type=Path, help="JSON lines, one per image"),
         ),
         _command(
             commands, "replay", "play a bag into the live nodes", _replay, bag,

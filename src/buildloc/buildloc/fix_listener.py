@@ -1,4 +1,5 @@
-"""A subscriber as an integrator would write it: prints every message of /buildloc/fix, one JSON line each.
+"""A subscriber as an integrator would write it: prints every message of /buildloc/fix and when it came, one
+JSON line each.
 
 python -m buildloc.fix_listener [--out FIXES.jsonl]
 """
@@ -9,6 +10,7 @@ import argparse
 import json
 import math
 import sys
+import time
 from collections import OrderedDict
 from pathlib import Path
 from typing import Any, TextIO
@@ -56,7 +58,8 @@ class FixListener(Node):  # type: ignore[misc]
             self._write(self._fixes.pop(stamp_ns), self._poses.pop(stamp_ns))
 
     def _write(self, fix: Fix | NoFix, pose: tuple[float, float, float]) -> None:
-        self._out.write(json.dumps(record(fix, pose)) + "\n")
+        arrived = {"received_ns": time.time_ns()}
+        self._out.write(json.dumps(record(fix, pose) | arrived) + "\n")
         self._out.flush()
 
 

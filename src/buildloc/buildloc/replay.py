@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import importlib
 import signal
+import struct
 import subprocess
 import sys
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
@@ -32,6 +32,7 @@ from sensor_msgs.msg import PointCloud2
 from buildloc.bag import IMAGES, TELEMETRY, open_bag, raw_messages, require_topics
 from buildloc.settings import MAPPER, MATCHER, NODES, REFERENCE_DB, SEGMENTER, Settings
 from buildloc.supervisor import Supervisor, dds_environment, failures
+from buildloc.timing import Timing, timing
 
 START_TIMEOUT_S = 90.0
 STALL_TIMEOUT_S = 60.0
@@ -69,9 +70,11 @@ class ReplayReport:
 
 @dataclass(frozen=True)
 class Replay:
-    """What came of a replay: the figures, and the latest map with its keyframes (None, () without one)."""
+    """What came of a replay: the figures, how often and how late fixes came, and the latest map with its
+    keyframes (None, () without one)."""
 
     report: ReplayReport
+    timing: Timing
     local_map: LocalMap | None
     keyframes: tuple[Keyframe, ...]
 
@@ -167,9 +170,16 @@ def _wait(condition: Callable[[], bool], timeout_s: float, alive: Callable[[], N
     return False
 
 
-def _play(node: ReplayNode, bag: Path, rate: float, alive: Callable[[], None]) -> int:
-    """Publish everything in time; returns the number of images."""
-    published: Counter[str] = Counter()
+def _stamp_ns(data: bytes) -> int:
+    """The header's stamp of a serialized message that begins with one."""
+    seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
+    return int(seconds) * 10**9 + int(nanoseconds)
+
+
+def _play(node: ReplayNode, bag: Path, rate: float, alive: Callable[[], None]) -> dict[int, int]:
+    """Publish everything in time; returns when each image was published, ns by the clock on the wall, by
+    its stamp."""
+    published: dict[int, int] = {}
     with open_bag(bag) as reader:
         started, first_ns = time.monotonic(), reader.start_time
         for connection, stamp_ns, data in raw_messages(reader, bag):
@@ -182,9 +192,10 @@ def _play(node: ReplayNode, bag: Path, rate: float, alive: Callable[[], None]) -
                 node.tick(int(stamp_ns - wait * rate * 1e9))
                 time.sleep(min(wait, CLOCK_PERIOD_S))
             node.tick(stamp_ns)
+            if connection.topic.lstrip("/") in IMAGES:
+                published.setdefault(_stamp_ns(data), time.time_ns())
             publisher.publish(bytes(data))
-            published[connection.topic.lstrip("/")] += 1
-    return max(published[topic] for topic in IMAGES)
+    return published
 
 
 def _drain(node: ReplayNode, images: int, alive: Callable[[], None]) -> None:
@@ -240,12 +251,13 @@ def replay(bag: Path, settings: Settings | None, rate: float, folder: Path, fixe
                 raise ReplayError("the nodes did not come up in time; see their output above")
             time.sleep(SETTLE_S)
             started = time.monotonic()
-            images = _play(node, bag, rate, alive)
-            _drain(node, images, alive)
-            report = node.report(images, time.monotonic() - started)
+            published_ns = _play(node, bag, rate, alive)
+            _drain(node, len(published_ns), alive)
+            report = node.report(len(published_ns), time.monotonic() - started)
             recorded_map, path = node.latest.get(topics.MAP), node.latest.get(topics.KEYFRAMES)
             return Replay(
                 report,
+                timing(fixes, published_ns),
                 None if recorded_map is None else wire.decode_map(recorded_map),
                 () if path is None else wire.decode_keyframes(path),
             )

@@ -39,10 +39,13 @@ from buildloc_eval.sim import write_flight
 from buildloc_eval.truth import Truth, read_truth
 from buildloc_eval.world import OrthoWorld
 
-RATE = 4.0
-FLIGHT = FlightConfig(length_m=2000.0, leg_m=420.0, spacing_m=80.0, speed_mps=5.0, altitude_swing_m=5.0)
+RATE = 1.0  # rate and latency of fixes are measured
+FLIGHT = FlightConfig(
+    length_m=2000.0, leg_m=420.0, spacing_m=80.0, speed_mps=5.0, altitude_swing_m=5.0, rate_hz=8.0
+)
 EAST_HALF = 4096 / 8704
-WIDE = FlightConfig(length_m=2000.0, leg_m=900.0, spacing_m=80.0, speed_mps=5.0, altitude_swing_m=5.0)
+WIDE = dataclasses.replace(FLIGHT, leg_m=900.0)
+QUICK_LENGTH_M = 800.0
 BASELINE = "models/baseline_west.onnx"
 NEAR_BIN_M = 150.0  # the true 100 m bin and its eight neighbours
 FOUND_M = 5.0

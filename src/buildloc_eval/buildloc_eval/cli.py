@@ -159,7 +159,7 @@ def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `buildloc eval`."""
     parser.add_argument(
         "name",
-        choices=["barnarp", "integrity", "mapping", "paper", "scale", "segmentation"],
+        choices=["barnarp", "beyond", "integrity", "mapping", "paper", "scale", "segmentation"],
         help="which evaluation",
     )
     parser.add_argument(
@@ -170,6 +170,17 @@ def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument_group("eval scale").add_argument(
         "--levels", nargs="+", type=_level, metavar="LEVEL",
         help="levels of the maps' errors: numbers, or `measured` on the segmenter (default: 1 2 3)",
+    )  # fmt: skip
+    paper = parser.add_argument_group("eval paper")
+    paper.add_argument(
+        "--parts",
+        nargs="+",
+        choices=["boston", "tokyo", "real"],
+        help="parts to run and report (default: all)",
+    )
+    paper.add_argument(
+        "--model", action="append", default=[], metavar="PLACE=MODEL", dest="models",
+        help="ONNX network for real imagery of a place that it never saw; repeatable (default: shipped one)",
     )  # fmt: skip
     group = parser.add_argument_group("eval integrity")
     group.add_argument(
@@ -208,6 +219,8 @@ def run_eval(args: argparse.Namespace) -> int:
         )
     if args.name != "scale" and args.levels:
         raise BuildlocError(f"--levels is of `eval scale`, not of `eval {args.name}`")
+    if args.name != "paper" and (args.parts or args.models):
+        raise BuildlocError(f"--parts and --model are of `eval paper`, not of `eval {args.name}`")
     if args.name != "integrity" and (args.plan or args.trials):
         raise BuildlocError(f"--plan and --trials are of `eval integrity`, not of `eval {args.name}`")
     if args.name == "scale":
@@ -215,6 +228,10 @@ def run_eval(args: argparse.Namespace) -> int:
 
         levels = None if args.levels is None else tuple(args.levels)
         print(scale.evaluate(args.out, args.seed, args.quick, _stage, levels))
+    elif args.name == "beyond":
+        from buildloc_eval.beyond import evaluate as beyond
+
+        print(beyond.evaluate(args.out, args.seed, args.quick, _stage))
     elif args.name == "integrity":
         from buildloc_eval.integrity import evaluate as integrity
 
@@ -226,8 +243,13 @@ def run_eval(args: argparse.Namespace) -> int:
         print(mapping.evaluate(args.out, args.seed, args.quick, _stage))
     elif args.name == "paper":
         from buildloc_eval.paper import evaluate as paper
+        from buildloc_eval.segmentation import parse_case
 
-        print(paper.evaluate(args.out, args.seed, args.quick, _stage))
+        given = {case.place: case.model for case in (parse_case(text, "--model") for text in args.models)}
+        parts = args.parts or paper.PARTS
+        if given and "real" not in parts:
+            raise BuildlocError("--model is of the part real; add it to --parts")
+        print(paper.evaluate(args.out, args.seed, args.quick, _stage, parts, given))
     elif args.name == "segmentation":
         from buildloc_eval import segmentation
 

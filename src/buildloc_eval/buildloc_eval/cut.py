@@ -83,17 +83,18 @@ def cut(
     altitude_factor: float = 1.0,
 ) -> CutFlight:
     """The keyframes that the segmenter's policy would choose among the images of a trajectory."""
-    policy, last = SegmenterConfig(), None
-    stamps, poses = list[int](), list[tuple[float, ...]]()
-    step = round(1e9 / config.rate_hz)
-    for stamp in range(int(trajectory.stamps_ns[0]), int(trajectory.stamps_ns[-1]) + 1, step):
-        pose = trajectory.at(stamp)
-        now = Moment(stamp, -pose[3])
+    stamps = keyframe_stamps(trajectory, config.rate_hz)
+    poses = np.array([trajectory.at(stamp) for stamp in stamps])
+    camera = camera_model(config)
+    return CutFlight(name, picture, labels, camera, config, stamps, poses, seed, altitude_factor)
+
+
+def keyframe_stamps(trajectory: Trajectory, rate_hz: float) -> tuple[int, ...]:
+    """Of the images that the segmenter's policy would choose."""
+    policy, last, stamps = SegmenterConfig(), None, list[int]()
+    for stamp in range(int(trajectory.stamps_ns[0]), int(trajectory.stamps_ns[-1]) + 1, round(1e9 / rate_hz)):
+        now = Moment(stamp, -trajectory.at(stamp)[3])
         if is_keyframe(last, now, policy):
             last = now
             stamps.append(stamp)
-            poses.append(pose)
-    camera = camera_model(config)
-    return CutFlight(
-        name, picture, labels, camera, config, tuple(stamps), np.array(poses), seed, altitude_factor
-    )
+    return tuple(stamps)

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 
 import faiss
 import numpy as np
+from buildloc_matcher.config import matcher_config
 from buildloc_matcher.match_cache import MakeStarMatcher
+from buildloc_matcher.matcher import Matcher
 from buildloc_matcher.matching import Matches, QueryStars, query_stars
 from buildloc_matcher.reference.database import ReferenceDatabase
 from numpy.typing import NDArray
@@ -86,3 +88,13 @@ def reference_stars(database: ReferenceDatabase) -> QueryStars:
     parts = [query_stars(tile.triangles, tile.buildings.areas_m2) for tile in database.tiles]
     features, areas = [part.features for part in parts], [part.areas_m2 for part in parts]
     return QueryStars(np.concatenate(features), np.concatenate(areas))
+
+
+def method(name: str, database: ReferenceDatabase) -> Matcher:
+    """A matcher by the name of its preset or of its candidate generator."""
+    paper, default = matcher_config({"preset": "paper"}), matcher_config()
+    if name == "index 32-D":
+        return Matcher(database, default, nearest_stars(full_vector, database))
+    if name == "shape-free 8-D":
+        return Matcher(database, paper, nearest_stars(shapeless_vector, database))
+    return Matcher(database, paper if name == "paper" else default)

@@ -30,13 +30,15 @@ JOINED_M = 0.25  # outlines nearer than this are one building in a mask
 class LabelledGround:
     """An orthophoto and its building outlines, UTM metres, as if the zone were a plane.
 
-    ``labels`` is 255 on buildings. ``buildings`` (N,) polygons: outlines that touch are one.
+    ``labels`` is 255 on buildings. ``outlines`` (M,) polygons as they were drawn; ``buildings`` (N,): those
+    that touch are one.
     """
 
     name: str
     picture: PictureWorld
     labels: PictureWorld
     buildings: NDArray[np.object_]
+    outlines: NDArray[np.object_]
 
     def flown_m(self) -> Box:
         """Where flights go: not farther than ``AROUND_M`` from what is labelled."""
@@ -115,5 +117,5 @@ def _ground(
     joined = shapely.buffer(shapely.union_all(shapely.buffer(metres, JOINED_M)), -JOINED_M)
     world = (epsg, left_m, top_m, gsd_m)
     return LabelledGround(
-        name, PictureWorld(image, *world), PictureWorld(labels, *world), shapely.get_parts(joined)
+        name, PictureWorld(image, *world), PictureWorld(labels, *world), shapely.get_parts(joined), metres
     )

@@ -32,19 +32,18 @@ from buildloc_matcher.reference.region import Circle
 from buildloc_msgs_py.types import LocalMap
 from matplotlib.ticker import NullFormatter
 from scipy.spatial import cKDTree
-from scipy.stats import binomtest
 
-from buildloc_eval.generators import full_vector, nearest_stars, reference_stars, shapeless_vector
+from buildloc_eval.generators import method, reference_stars
 from buildloc_eval.html import write_report
 from buildloc_eval.machine import machine
 from buildloc_eval.memory import peak_memory_mb
 from buildloc_eval.observation import Digitiser, Level, ObservedMap, observe_map, sensing
 from buildloc_eval.realworld import LEXINGTON_DEG, data_folder
+from buildloc_eval.trials import run_trial, summary
 
 Progress = Callable[[str], None]
 
 SOURCE = "footprints/boston_osm.parquet"
-CORRECT_M = 100.0
 OUTSIDE_M = 1000.0
 TICKS = (20_000, 50_000, 100_000, 200_000, 500_000)
 REAL = "reference: real footprints (OpenStreetMap, greater Boston); maps: simulated; no images"
@@ -81,58 +80,6 @@ class Plan:
 
 FULL = Plan(SIZES, (30, 60, 100, 200), (1, 2, 3), 200, 40, ("paper", "index 32-D", "shape-free 8-D"), 3)
 QUICK = Plan((SIZES[1], SIZES[3]), (60, 100), (1, 2), 20, 10, ("paper",), 1)
-
-
-@dataclass(frozen=True)
-class Trial:
-    """One map located: rank of the first candidate within CORRECT_M of the truth (0: none), error of the
-    best, whether it was accepted as a fix, and seconds per stage."""
-
-    rank: int
-    error_m: float
-    accepted: bool
-    seconds: dict[str, float]
-
-
-def method(name: str, database: ReferenceDatabase) -> Matcher:
-    """A matcher by the name of its preset or of its candidate generator."""
-    paper, default = matcher_config({"preset": "paper"}), matcher_config()
-    if name == "index 32-D":
-        return Matcher(database, default, nearest_stars(full_vector, database))
-    if name == "shape-free 8-D":
-        return Matcher(database, paper, nearest_stars(shapeless_vector, database))
-    return Matcher(database, paper if name == "paper" else default)
-
-
-def run_trial(matcher: Matcher, observed: ObservedMap) -> Trial:
-    """Locate a map and compare with the truth."""
-    found = matcher.locate(observed.local_map)
-    errors = [
-        math.hypot(c.x_m - observed.centre_m[0], c.y_m - observed.centre_m[1]) for c in found.candidates
-    ]
-    ranks = [rank for rank, error in enumerate(errors, start=1) if error <= CORRECT_M]
-    accepted = matcher.judge(found).reason is None
-    return Trial(ranks[0] if ranks else 0, errors[0] if errors else math.inf, accepted, found.seconds)
-
-
-def summary(trials: Sequence[Trial]) -> dict[str, Any]:
-    """Recall at 1, 5, 10 with the 95 % interval of the first; errors; fixes; milliseconds per stage."""
-    count, right = len(trials), [t for t in trials if t.rank == 1]
-    interval = binomtest(len(right), count).proportion_ci(method="wilson")
-    stages = {
-        stage: float(np.median([1e3 * t.seconds.get(stage, 0.0) for t in trials]))
-        for stage in trials[0].seconds
-    }
-    return {
-        "maps": count,
-        **{f"recall@{k}": sum(0 < t.rank <= k for t in trials) / count for k in (1, 5, 10)},
-        "recall@1_95%": [round(interval.low, 4), round(interval.high, 4)],
-        "median_error_m": float(np.median([t.error_m for t in right])) if right else None,
-        "fixes": sum(t.accepted for t in trials) / count,
-        "false_fixes": sum(t.accepted and t.rank != 1 for t in trials),
-        "ms": stages,
-        "ms_total": float(np.median([1e3 * sum(t.seconds.values()) for t in trials])),
-    }
 
 
 def draw(database: ReferenceDatabase, tree: cKDTree, count: int, level: Level, seed: int) -> ObservedMap:

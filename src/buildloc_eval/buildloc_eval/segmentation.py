@@ -63,11 +63,11 @@ class Case:
     model: str
 
 
-def parse_case(text: str) -> Case:
-    """PLACE=MODEL. Raises EvaluationError."""
+def parse_case(text: str, option: str = "--case") -> Case:
+    """PLACE=MODEL of a command line's option. Raises EvaluationError."""
     name, equals, model = text.partition("=")
     if not (name and equals):
-        raise EvaluationError(f"--case {text}: expected PLACE=MODEL, such as barnarp=network.onnx")
+        raise EvaluationError(f"{option} {text}: expected PLACE=MODEL, such as barnarp=network.onnx")
     return Case(name, model)
 
 

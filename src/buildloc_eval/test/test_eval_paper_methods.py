@@ -17,7 +17,7 @@ from buildloc_eval.paper.flown import Maps, Snapshot
 from buildloc_eval.paper.methods import BRM, STARS, Prediction
 from buildloc_eval.paper.plan import Models, Plan, Stores, maps_name, ragged
 from buildloc_eval.paper.published import FLIGHTS
-from buildloc_eval.paper.report import held, write
+from buildloc_eval.paper.report import boston, held, write
 from buildloc_eval.paper.scoring import (
     Score,
     bins_within,
@@ -280,7 +280,7 @@ def test_a_run_is_predicted_scored_and_reported_and_goes_on_where_it_was(
     tmp_path: Path, outlines: np.ndarray, maps: Maps
 ) -> None:
     flight = PaperFlight(FLIGHTS[0], (float(CENTRE[0]), float(CENTRE[1])))
-    plan, models, said = Plan((1,), 1, (1,), {"default preset": (1,)}, 1), Models(ERRORS), list[str]()
+    plan, models, said = Plan(("flight1",), 1, (1,), {"default preset": (1,)}, 1), Models(ERRORS), list[str]()
     stores = Stores(tmp_path, 1, models)
     stores.ground.save("reference", (ragged(outlines), measured(outlines)))
     stores.maps.save(maps_name(flight, 1), maps)
@@ -290,15 +290,18 @@ def test_a_run_is_predicted_scored_and_reported_and_goes_on_where_it_was(
     assert any("min left" in line for line in said)
     predict_all(stores, [flight], plan, 1, said.append)
     assert made == {path: path.stat().st_mtime_ns for path in made}
-    text = write(tmp_path, stores, [flight], plan, models, 1, True, 12.0)
+    chapter = boston(tmp_path, stores, [flight], plan, models, 1)
+    text = write(tmp_path, [chapter], 1, True, 12.0)
     report = json.loads((tmp_path / "report.json").read_text())
-    assert list(report)[:3] == ["evaluation", "what is real", "not done"]
+    assert list(report)[:2] == ["evaluation", "what is real"]
     assert [row["what"].split(",")[0] for row in report["bars"]] == ["minutes of this run"]
-    recall = {(row["method"], row["metric"]): row for row in report["recall"]}
+    said = report[chapter.title]
+    assert list(said)[:2] == ["what is real", "not done"]
+    recall = {(row["method"], row["metric"]): row for row in said["recall"]}
     assert recall["default preset", "R@1"]["1 km"].startswith("1.000 [0.21, 1.00]")
     assert recall["paper preset", "R@1"]["paper, 1 km"] == "7/7"
     assert recall["NetVLAD (not run)", "R@1"]["paper, 1 km"] == "5/7"
-    (trace,) = report["convergence"]
+    (trace,) = said["convergence"]
     assert trace["first success"] <= trace["stable success"] <= len(maps.true_m)
     html = (tmp_path / "report.html").read_text()
     assert html.count("<img") == 4 and 'src="http' not in html

@@ -12,7 +12,8 @@ from buildloc_eval import scale
 from buildloc_eval.generators import full_vector, nearest_stars, shapeless_vector
 from buildloc_eval.observation import Digitiser, ObservationError, Sensing, observe_map, sensing
 from buildloc_eval.realworld import DataError, data_folder
-from buildloc_eval.scale import Plan, Size, Trial, summary
+from buildloc_eval.scale import Plan, Size
+from buildloc_eval.trials import Trial, summary
 from buildloc_matcher.config import matcher_config
 from buildloc_matcher.matching import QueryStars
 from buildloc_matcher.reference.buildings import Buildings

@@ -9,15 +9,14 @@ from dataclasses import dataclass
 from buildloc_msgs_py.config import check
 from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.ground import validate_frame
-from buildloc_msgs_py.types import FloatArray, Frame, Keyframe, LocalMap, Mask
+from buildloc_msgs_py.types import Frame, Keyframe, LocalMap, Mask, Tracked
 
 from buildloc_mapper.atlas import Atlas
 from buildloc_mapper.config import MapperConfig
 from buildloc_mapper.extraction import Extractor, LocalOutlines
 from buildloc_mapper.fusion import Fusion, View
 from buildloc_mapper.pose_graph import PoseGraph
-from buildloc_mapper.similarity import Similarity, compose_covariance
-from buildloc_mapper.tracking import Lost, Tracked, Tracker
+from buildloc_mapper.tracking import Lost, Tracker
 
 
 class MapperError(BuildlocError):
@@ -89,21 +88,15 @@ class Mapper:
         T_new_old = None  # noqa: N806
         if before is not None and before in graph.poses:
             T_new_old = graph.poses[keyframe].inverse().compose(graph.poses[before])  # noqa: N806
-        self._tracker.rebase(keyframe, frame.stamp_ns, self._atlas.prepared(keyframe), T_new_old)
-        return self._update(keyframe, started)
+        update = self._update(keyframe, started)
+        # Only now: whoever is told of a frame tracked in this keyframe is to know the keyframe.
+        self._tracker.rebase(frame.stamp_ns, self._atlas.prepared(keyframe), T_new_old)
+        return update
 
     def track(self, frame: Frame) -> Tracked | Lost:
-        """Where a frame between keyframes is, in the latest keyframe of the map. Raises WireError for
-        unusable telemetry."""
+        """Where a frame between keyframes is, in the latest keyframe of the map; may run while a keyframe is
+        added on another thread. Raises WireError for unusable telemetry."""
         return self._tracker.track(frame)
-
-    def on_map(self, tracked: Tracked) -> tuple[Similarity, FloatArray]:
-        """A tracked pose in ``buildloc_map``, and its (4, 4) covariance over x, y, yaw and log scale as seen
-        from the map's first keyframe, the altimeter's bias left out."""
-        graph = self._atlas.submap(tracked.keyframe)
-        pose, covariance = graph.poses[tracked.keyframe], graph.covariance(tracked.keyframe)
-        to_frame = tracked.T_keyframe_frame
-        return pose.compose(to_frame), compose_covariance(pose, covariance, to_frame, tracked.covariance)
 
     def finish(self) -> MapUpdate | None:
         """The map with every keyframe drawn where it is by now; None before the first."""

@@ -41,18 +41,6 @@ class Similarity(NamedTuple):
         return np.array([[c, -s, self.x_m], [s, c, self.y_m], [0.0, 0.0, 1.0]])
 
 
-def compose_covariance(
-    one: Similarity, of_one: FloatArray, other: Similarity, of_other: FloatArray
-) -> FloatArray:
-    """(4, 4) covariance of ``one.compose(other)`` over x, y, yaw and log scale from those of both, which are
-    independent."""
-    c, s = one.scale * math.cos(one.yaw_rad), one.scale * math.sin(one.yaw_rad)
-    dx, dy = c * other.x_m - s * other.y_m, s * other.x_m + c * other.y_m
-    by_one = np.array([[1.0, 0.0, -dy, dx], [0.0, 1.0, dx, dy], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-    by_other = np.array([[c, -s, 0.0, 0.0], [s, c, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-    return np.asarray(by_one @ of_one @ by_one.T + by_other @ of_other @ by_other.T, dtype=np.float64)
-
-
 def fit_similarity(
     source_m: FloatArray, target_m: FloatArray, moved_m: FloatArray, relief_rad: float
 ) -> tuple[Similarity, FloatArray]:

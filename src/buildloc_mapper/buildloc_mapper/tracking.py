@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass, replace
 
 from buildloc_msgs_py.ground import validate_frame
-from buildloc_msgs_py.types import FloatArray, Frame
+from buildloc_msgs_py.types import Frame, Tracked
 
 from buildloc_mapper.config import MapperConfig
 from buildloc_mapper.level import level_image
@@ -14,18 +15,6 @@ from buildloc_mapper.registration import Link, Prepared, Registration, Rejection
 from buildloc_mapper.similarity import Similarity
 
 NOWHERE = Similarity(0.0, 0.0, 0.0, 1.0)
-
-
-@dataclass(frozen=True)
-class Tracked:
-    """Pose of a frame in a keyframe, its (4, 4) covariance over x, y, yaw and log scale, and the corners
-    that agree."""
-
-    stamp_ns: int
-    keyframe: int
-    T_keyframe_frame: Similarity
-    covariance: FloatArray
-    inliers: int
 
 
 @dataclass(frozen=True)
@@ -56,7 +45,6 @@ class _Motion:
 class _Base:
     """The keyframe that frames are tracked against."""
 
-    keyframe: int
     stamp_ns: int
     prepared: Prepared
 
@@ -71,26 +59,27 @@ class Tracker:
 
     def reset(self) -> None:
         """Forget the flight."""
+        self._rebases: deque[tuple[_Base, Similarity | None]] = deque()
         self._base: _Base | None = None
         self._motion: _Motion | None = None
 
-    def rebase(
-        self,
-        keyframe: int,
-        stamp_ns: int,
-        prepared: Prepared,
-        T_new_old: Similarity | None,  # noqa: N803
-    ) -> None:
-        """Track against another keyframe, in which the one before lies at ``T_new_old``; None: unknown."""
-        self._base = _Base(keyframe, stamp_ns, prepared)
-        if self._motion is not None and T_new_old is not None:
-            self._motion = replace(self._motion, pose=T_new_old.compose(self._motion.pose))
-        else:
-            self._motion = None
+    def rebase(self, stamp_ns: int, prepared: Prepared, T_new_old: Similarity | None) -> None:  # noqa: N803
+        """Track against another keyframe from the next frame on, in which the one before lies at
+        ``T_new_old``; None: unknown. It may come from another thread than :meth:`track`."""
+        self._rebases.append((_Base(stamp_ns, prepared), T_new_old))
+
+    def _take_over(self) -> None:
+        while self._rebases:
+            self._base, T_new_old = self._rebases.popleft()  # noqa: N806
+            if self._motion is not None and T_new_old is not None:
+                self._motion = replace(self._motion, pose=T_new_old.compose(self._motion.pose))
+            else:
+                self._motion = None
 
     def track(self, frame: Frame) -> Tracked | Lost:
         """Where a frame is. Raises WireError for unusable telemetry."""
         validate_frame(frame)
+        self._take_over()
         if (base := self._base) is None:
             return Lost(frame.stamp_ns, "no_keyframe")
         link = self._follow(base, frame)
@@ -100,8 +89,9 @@ class Tracker:
             self._motion = None
             return Lost(frame.stamp_ns, link.reason)
         self._moved(frame.stamp_ns, link.transform)
+        x, y, yaw, scale = link.transform
         covariance = link_covariance(link, self._config)
-        return Tracked(frame.stamp_ns, base.keyframe, link.transform, covariance, link.inliers)
+        return Tracked(frame.stamp_ns, base.stamp_ns, x, y, yaw, scale * frame.altitude_m, covariance)
 
     def _follow(self, base: _Base, frame: Frame) -> Link | Rejection:
         start = self._motion or _Motion(base.stamp_ns, NOWHERE, NOWHERE, 0.0)

@@ -114,10 +114,8 @@ def judge_candidate(
     return Verdict(Outcome.ACCEPTED, None, nats, chance)
 
 
-def refuse_refined(refined: Refined | None, config: MatcherConfig) -> str | None:
+def refuse_refined(refined: Refined, config: MatcherConfig) -> str | None:
     """Why the refined pose is not convincing, or None."""
-    if refined is None:
-        return "refinement found no buildings of the recent frames in the reference"
     if refined.buildings < config.min_pairs:
         return f"refinement matched {refined.buildings} buildings, fewer than {config.min_pairs}"
     if refined.rms_m > config.max_residual_m:

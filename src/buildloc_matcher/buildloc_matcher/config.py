@@ -77,6 +77,22 @@ class MatcherConfig:
     refine_distance_m: float = param(15.0, "1-NN distance of the first refinement step, m", 0.1, 1000.0)
     refine_last_distance_m: float = param(8.0, "1-NN distance of the last refinement step, m", 0.1, 1000.0)
     refine_iterations: int = param(6, "refinement steps while the distance shrinks", 1, 100)
+    sigma_frame_m: float = param(
+        0.4, "least error of a building's centroid that is new in every frame, per axis, m", 0.05, 10.0
+    )
+    sigma_building_m: float = param(
+        0.6, "least error of it that all frames share, the reference's own included, per axis, m", 0.05, 10.0
+    )
+    walk_m: float = param(
+        0.05, "error of the mapper from keyframe to keyframe, per axis, m per root of a metre", 0.001, 5.0
+    )
+    walk_deg: float = param(0.05, "the same of its heading, deg per root of a metre", 0.001, 10.0)
+    sigma_registration_m: float = param(
+        1.5, "error that all buildings of the reference share, per axis, m", 0.0, 10.0
+    )
+    min_optimum_lead: float = param(
+        10.0, "smallest lead of the refined pose over another one within 20 m that fits too, nats", 0.0, 1e4
+    )
     min_buildings: int = param(12, "fewest buildings in the map for a fix", 3, 100000)
     min_jaccard: float = param(0.2, "smallest MNN-Jaccard of an accepted candidate", 0.0, 1.0)
     target_false_fix_rate: float = param(
@@ -85,9 +101,27 @@ class MatcherConfig:
     rival_distance_m: float = param(15.0, "candidates further away than this are elsewhere, m", 0.0, 1e6)
     min_pairs: int = param(10, "fewest distinct reference buildings matched for a fix", 3, 100000)
     max_residual_m: float = param(10.0, "largest RMS distance of the matched pairs for a fix, m", 0.1, 1000.0)
-    sigma_floor_m: float = param(3.0, "smallest horizontal standard deviation reported, m", 0.1, 1000.0)
-    sigma_inflation: float = param(2.0, "factor on the residual-based standard deviation", 1.0, 100.0)
     sigma_up_m: float = param(100.0, "standard deviation reported for the altitude, m", 0.1, 10000.0)
+    follow_frames: int = param(4, "latest keyframes whose buildings agree with the reference or not", 1, 100)
+    follow_nats: float = param(
+        7.0, "evidence that decides for or against a predicted place, nats; less decides nothing", 0.1, 1e3
+    )
+    max_jump_sigmas: float = param(
+        5.0, "farthest that an agreement may lie from the prediction, standard deviations", 1.0, 100.0
+    )
+    drift_share: float = param(
+        0.02, "standard deviation of a place carried on without an agreement, over the distance", 0.0, 1.0
+    )
+    drift_deg_per_km: float = param(3.0, "the same of the heading, deg per km", 0.0, 1000.0)
+    max_coast_m: float = param(
+        300.0, "distance without an agreement after which a place is withdrawn, m", 1.0, 1e5
+    )
+    max_track_sigma_m: float = param(
+        15.0, "standard deviation without an agreement at which a place is withdrawn, m", 0.1, 1000.0
+    )
+    check_keyframes: int = param(
+        6, "keyframes from one global search to the next while tracking, which must confirm", 1, 10000
+    )
 
 
 DEFAULT = "default"

@@ -22,13 +22,15 @@ from buildloc_matcher.acceptance import (
 )
 from buildloc_matcher.config import MatcherConfig, check_matcher
 from buildloc_matcher.evidence import QueryMap, query_map, seed_evidence
-from buildloc_matcher.geometry import Similarity
+from buildloc_matcher.follow import Opinion, ask, seen_in_world
+from buildloc_matcher.geometry import Similarity, wrap
 from buildloc_matcher.hypotheses import hypothesize
 from buildloc_matcher.local_map import check_map
 from buildloc_matcher.match_cache import MakeStarMatcher, MatchCache, StarMatcher
 from buildloc_matcher.mesh import Mesh, mesh
+from buildloc_matcher.pursuit import Agreement, Place, Pose, sigmas_apart
 from buildloc_matcher.reference.database import DatabaseError, ReferenceDatabase, descriptor_hash
-from buildloc_matcher.refinement import covariance_enu, refine
+from buildloc_matcher.refinement import Refined, Unrefined, covariance_enu, refine
 from buildloc_matcher.selection import Score, local_transform, select
 from buildloc_matcher.voting import Cluster, vote
 
@@ -53,11 +55,21 @@ class MatchResult:
 
 @dataclass(frozen=True)
 class Answer:
-    """A fix or the reason for none, the candidates behind it and the funnel of the solve."""
+    """A fix or the reason for none, the candidates behind it and the funnel of the solve; what the
+    reference agrees to, if it does."""
 
     result: Fix | NoFix
     candidates: tuple[Candidate, ...]
     funnel: dict[str, float]
+    agreement: Agreement | None = None
+
+
+@dataclass(frozen=True)
+class Followed:
+    """What the reference says about a prediction, and with an agreement what it agrees to."""
+
+    opinion: Opinion
+    agreement: Agreement | None
 
 
 @dataclass(frozen=True)
@@ -222,14 +234,63 @@ class Matcher:
         last = max(keyframes, key=lambda k: k.stamp_ns)
         coarse = self.place(found, np.array([last.x_m, last.y_m]))
         refined = refine(coarse, keyframes, observations, self.database.ground, self.config)
+        if isinstance(refined, Unrefined):
+            return none(refined.reason)
         refused = refuse_refined(refined, self.config)
-        if refined is None or refused is not None:
-            return none(refused or "refinement failed")
+        if refused is not None:
+            return none(refused)
         funnel |= {"refine_observed": refined.observed, "refine_pairs": refined.pairs}
         funnel |= {"refine_buildings": refined.buildings, "refine_rms_m": refined.rms_m}
         altitude = next((o.altitude_m for o in observations if o.stamp_ns == last.stamp_ns), float("nan"))
-        east, north = float(refined.position_m[0]), float(refined.position_m[1])
-        latitude, longitude = self.database.to_wgs84(east, north)
-        covariance = covariance_enu(refined, self.config)
-        fix = Fix(last.stamp_ns, latitude, longitude, altitude, east, north, refined.yaw_rad, covariance)
-        return Answer(fix, found.candidates, funnel)
+        agreement = Agreement(_refined(refined), refined.covariance, coarse.scale)
+        place = Place(last.stamp_ns, *agreement.poses[last.stamp_ns], refined.covariance)
+        return Answer(self.fix_at(place, altitude), found.candidates, funnel, agreement)
+
+    def fix_at(self, place: Place, altitude_m: float) -> Fix:
+        """The fix of a camera at a place."""
+        latitude, longitude = self.database.to_wgs84(place.x_m, place.y_m)
+        covariance = covariance_enu(place.covariance, self.config)
+        return Fix(
+            place.stamp_ns, latitude, longitude, altitude_m, place.x_m, place.y_m, place.yaw_rad, covariance,
+            float(place.covariance[2, 2]),
+        )  # fmt: skip
+
+    def follow(
+        self,
+        predicted: Similarity,
+        covariance: FloatArray,
+        keyframes: Sequence[Keyframe],
+        observations: Sequence[FrameObservation],
+    ) -> Followed:
+        """Whether the reference agrees that the last keyframe lies where ``predicted`` (map -> world) puts
+        it, up to a covariance (3, 3) over east, north and yaw."""
+        config, reference = self.config, self.database.ground
+        last = max(keyframes, key=lambda k: k.stamp_ns)
+        refined = refine(predicted, keyframes, observations, reference, config)
+        poses = _placed(predicted, keyframes) if isinstance(refined, Unrefined) else _refined(refined)
+        offset = np.array(poses[last.stamp_ns]) - np.array(_placed(predicted, [last])[last.stamp_ns])
+        offset[2] = wrap(offset[2])
+        seen = seen_in_world(poses, observations, config.follow_frames)
+        opinion = ask(seen, offset[:2], covariance, reference, config)
+        if isinstance(refined, Unrefined) or opinion.outcome is not Outcome.ACCEPTED:
+            return Followed(opinion, None)
+        if (refused := refuse_refined(refined, config)) is not None:
+            return Followed(replace(opinion, outcome=Outcome.UNDECIDED, reason=refused), None)
+        apart = sigmas_apart(offset, covariance + refined.covariance)
+        if apart > config.max_jump_sigmas:
+            jump = f"the place jumped by {math.hypot(*offset[:2]):.1f} m, {apart:.1f} standard deviations"
+            return Followed(replace(opinion, outcome=Outcome.REJECTED, reason=jump), None)
+        return Followed(opinion, Agreement(poses, refined.covariance, predicted.scale))
+
+
+def _refined(refined: Refined) -> dict[int, Pose]:
+    return {stamp: (float(x), float(y), float(yaw)) for stamp, (x, y, yaw) in refined.poses.items()}
+
+
+def _placed(similarity: Similarity, keyframes: Sequence[Keyframe]) -> dict[int, Pose]:
+    """x, y and yaw of keyframes in the world, by stamp."""
+    places = similarity.apply(np.array([(k.x_m, k.y_m) for k in keyframes])).tolist()
+    return {
+        k.stamp_ns: (x, y, k.yaw_rad + similarity.yaw_rad)
+        for k, (x, y) in zip(keyframes, places, strict=True)
+    }

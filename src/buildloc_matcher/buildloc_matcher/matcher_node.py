@@ -1,14 +1,16 @@
-"""/buildloc/map, keyframes and mask in; candidates, fix and pose out.
+"""/buildloc/map, keyframes, track and mask in; candidates, fix and pose out.
 
-An accepted fix is published exactly once, with the capture time of its image. While there is none,
-NO_FIX goes out at 1 Hz and /diagnostics says why. Solving runs on one worker thread, so that a slow
-solve never stops the NO_FIX.
+A fix is published exactly once, in the order of the images, with the capture time of its own. While there
+is none, NO_FIX goes out at 1 Hz, and at once when a place is withdrawn; /diagnostics says why. Solving runs
+on one worker thread, so that a slow solve stops neither tracked fixes nor the NO_FIX.
 """
 
 from __future__ import annotations
 
 import sys
 import threading
+import time
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -16,7 +18,7 @@ from typing import Any
 
 from buildloc_msgs_py import encode, qos, topics, wire
 from buildloc_msgs_py.ros_node import Diagnostics, declare_config, run_node
-from buildloc_msgs_py.types import Fix
+from buildloc_msgs_py.types import Fix, NoFix
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, QuaternionStamped
 from nav_msgs.msg import Path
@@ -29,6 +31,7 @@ from buildloc_matcher.config import DEFAULT, MatcherConfig, check_matcher, prese
 from buildloc_matcher.session import Job, Session
 
 NO_FIX_PERIOD_S = 1.0
+FIXES_KEPT = 50  # whose rate and latency are told
 
 
 class MatcherNode(Node):  # type: ignore[misc]
@@ -43,7 +46,8 @@ class MatcherNode(Node):  # type: ignore[misc]
         self._worker = ThreadPoolExecutor(1, "solve")
         self._fixed = False
         self._next: Job | None = None
-        self._answered = self._fixes = 0
+        self._answered = self._fixes = self._withdrawals = 0
+        self._recent: deque[tuple[float, float]] = deque(maxlen=FIXES_KEPT)  # when and how late, s
         self._funnel: dict[str, float] = {}
         self._candidates = self.create_publisher(PointCloud2, topics.CANDIDATES, qos.SENSOR)
         self._fix = self.create_publisher(NavSatFix, topics.FIX, qos.SENSOR)
@@ -61,7 +65,8 @@ class MatcherNode(Node):  # type: ignore[misc]
             (Image, topics.MASK, qos.SENSOR, partial(self._guarded, self._on_mask)),
             (PointCloud2, topics.MAP, qos.SENSOR, partial(self._guarded, self._on_map)),
             (Path, topics.KEYFRAMES, qos.SENSOR, partial(self._guarded, self._on_keyframes)),
-            (Empty, topics.RESET_DONE, qos.SENSOR, lambda _: self.session.reset()),
+            (PoseWithCovarianceStamped, topics.TRACK, qos.SENSOR, partial(self._guarded, self._on_track)),
+            (Empty, topics.RESET_DONE, qos.SENSOR, self._on_reset),
             (String, topics.REFERENCE_DATABASE, qos.LATCHED, self._on_database),
         ):
             self.create_subscription(kind, topic, handle, profile)
@@ -81,6 +86,14 @@ class MatcherNode(Node):  # type: ignore[misc]
 
     def _on_keyframes(self, message: Path) -> None:
         self._submit(self.session.add_keyframes(wire.decode_keyframes(message)))
+        self._give(self.session.waiting())
+
+    def _on_track(self, message: PoseWithCovarianceStamped) -> None:
+        self._give(self.session.locate(wire.decode_tracked(message)))
+
+    def _on_reset(self, message: Empty) -> None:
+        self.session.reset()
+        self._recent.clear()
 
     def _on_database(self, message: String) -> None:
         self._worker.submit(self._load, message.data)
@@ -112,16 +125,30 @@ class MatcherNode(Node):  # type: ignore[misc]
         try:
             answer = self.session.solve(job)
         except Exception as error:
-            self.session.reason = f"solving failed: {type(error).__name__}: {error}"
-            self.get_logger().error(self.session.reason)
+            reason = f"solving failed: {type(error).__name__}: {error}"
+            self.get_logger().error(reason)
+            if self.session.seeker is not None:
+                self.session.seeker.reason = reason
             return
         self._funnel = answer.funnel
         self._candidates.publish(encode.encode_candidates(answer.candidates, job.local_map.stamp_ns))
-        if isinstance(answer.result, Fix):
-            with self._lock:
+        self._give(answer.result)
+
+    def _give(self, result: Fix | NoFix) -> None:
+        """Publish a fix unless a later one is out; the lack of one only when a place was just withdrawn."""
+        seeker = self.session.seeker
+        if seeker is None:
+            return
+        with self._lock:
+            if isinstance(result, Fix) and seeker.fresh(result):
                 self._fixed, self._fixes = True, self._fixes + 1
-                self._fix.publish(encode.encode_fix(answer.result))
-                self._pose.publish(encode.encode_pose(answer.result))
+                self._fix.publish(encode.encode_fix(result))
+                self._pose.publish(encode.encode_pose(result))
+                late_ns = self.get_clock().now().nanoseconds - result.stamp_ns
+                self._recent.append((time.monotonic(), late_ns * 1e-9))
+            elif self._withdrawals != seeker.withdrawals:
+                self._fix.publish(encode.encode_fix(self.session.waiting()))
+            self._withdrawals = seeker.withdrawals
 
     def _on_tick(self) -> None:
         with self._lock:
@@ -129,7 +156,7 @@ class MatcherNode(Node):  # type: ignore[misc]
                 self._fix.publish(encode.encode_fix(self.session.waiting()))
             fixed, self._fixed = self._fixed, False
         session = self.session
-        level = DiagnosticStatus.OK if session.matcher is not None else DiagnosticStatus.ERROR
+        level = DiagnosticStatus.OK if session.seeker is not None else DiagnosticStatus.ERROR
         self.diagnostics.report(
             level,
             "fix" if fixed else f"no fix: {session.waiting().reason}",
@@ -138,8 +165,27 @@ class MatcherNode(Node):  # type: ignore[misc]
             fixes=self._fixes,
             frames_unusable=session.frames_unusable,
             maps_skipped=session.maps_skipped,
+            **self._tracking(),
             **self._funnel,
         )
+
+    def _tracking(self) -> dict[str, object]:
+        """How the pursuit stands, and rate and latency of the latest fixes."""
+        if (seeker := self.session.seeker) is None:
+            return {}
+        pursuit = seeker.pursuit
+        with self._lock:
+            recent = list(self._recent)
+        span_s = recent[-1][0] - recent[0][0] if len(recent) > 1 else 0.0
+        late_s = sorted(late for _, late in recent)
+        return {
+            "mode": pursuit.mode.value,
+            "since_agreement_m": pursuit.since_agreement_m,
+            "withdrawals": seeker.withdrawals,
+            "withdrawn": pursuit.withdrawn,
+            "fixes_per_second": (len(recent) - 1) / span_s if span_s > 0.0 else 0.0,
+            "latency_p95_seconds": late_s[int(0.95 * len(late_s))] if late_s else 0.0,
+        }
 
     def destroy_node(self) -> None:
         """Let the running solve end first."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -123,37 +124,55 @@ def select(
     best = [cluster.best for cluster in ballot.clusters]
     seeds, places = corners[voters.stars[best]], voters.places_m[best]
     grown = grow(query, seeds, places, reference, config)
+    listed: list[_Listed] = []
     tested: set[int] = set()
     while True:
-        scored = _scored_matches(grown, ballot, query, reference, config)
-        if not scored or scored[0][0] in tested:
-            return [(ballot.clusters[c], score) for c, score in scored]
-        first = scored[0][0]
+        _list(grown, listed, ballot, query, reference, config)
+        first = listed[0].cluster if listed else -1
+        if first < 0 or first in tested:
+            return [(ballot.clusters[one.cluster], one.score) for one in listed]
         tested.add(first)
         moved = shifted(places[first], reference, config)
-        rivals = grow(
-            query, np.repeat(seeds[first : first + 1], len(moved), axis=0), moved, reference, config
-        )
-        grown += [(first, match) for _, match in rivals]
+        corner = np.repeat(seeds[first : first + 1], len(moved), axis=0)
+        grown = [(first, match) for _, match in grow(query, corner, moved, reference, config)]
 
 
-def _scored_matches(
-    grown: list[tuple[int, Grown]],
+@dataclass(frozen=True)
+class _Listed:
+    """A grown match with its full score and the number of its cluster."""
+
+    cluster: int
+    matches: NDArray[np.int64]
+    score: Score
+
+
+def _list(
+    grown: Sequence[tuple[int, Grown]],
+    listed: list[_Listed],
     ballot: Ballot,
     query: QueryMap,
     reference: Ground,
     config: MatcherConfig,
-) -> list[tuple[int, Score]]:
-    """Distinct matches, each with the number of its cluster, in full, best first."""
+) -> None:
+    """Add the best of the matches (by cluster) that are unlike those in the list, scored, best first."""
     ranked = sorted(grown, key=lambda found: -found[1].evidence)
-    scored: list[tuple[int, Score]] = []
+    added = 0
     for c, match in ranked:
-        if len(scored) == GROWN_SCORED or match.evidence < ranked[0][1].evidence - NEGLIGIBLE_NATS:
+        if added == GROWN_SCORED or match.evidence < ranked[0][1].evidence - NEGLIGIBLE_NATS:
             break
+        if any(_same(match.matches, other.matches) for other in listed):
+            continue
         score = score_grown(_start(ballot.clusters[c], query), match, query, reference, config)
-        if all(_apart(score, other) > config.mnn_distance_m for _, other in scored):
-            scored.append((c, score))
-    return sorted(scored, key=lambda pair: -pair[1].evidence)
+        if all(_apart(score, other.score) > config.mnn_distance_m for other in listed):
+            listed.append(_Listed(c, match.matches, score))
+            added += 1
+    listed.sort(key=lambda one: -one.score.evidence)
+
+
+def _same(one: NDArray[np.int64], other: NDArray[np.int64]) -> bool:
+    """Whether half of one's matched buildings have the same places in the other."""
+    matched = one >= 0
+    return 2 * int(np.count_nonzero(one[matched] == other[matched])) >= int(np.count_nonzero(matched))
 
 
 def _apart(one: Score, other: Score) -> float:

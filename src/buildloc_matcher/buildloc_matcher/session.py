@@ -10,14 +10,14 @@ from typing import Any
 from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.ground import observe
 from buildloc_msgs_py.pairing import Telemetry
-from buildloc_msgs_py.types import FrameObservation, Keyframe, LocalMap, Mask, NoFix
+from buildloc_msgs_py.types import Fix, FrameObservation, Keyframe, LocalMap, Mask, NoFix, Tracked
 
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.matcher import Answer, Matcher
 from buildloc_matcher.reference.database import open_database
+from buildloc_matcher.seeker import Seeker
 
 PENDING = 10
-WAITING = "waiting for a map"
 
 
 def frames_kept(config: MatcherConfig) -> int:
@@ -35,12 +35,12 @@ class Job:
 
 
 class Session:
-    """The state of one matcher: its reference, the telemetry, the frames seen and why there is no fix."""
+    """The state of one matcher: its reference or why there is none, the telemetry and the frames seen."""
 
     def __init__(self, config: MatcherConfig) -> None:
         self.config = config
         self.telemetry = Telemetry()
-        self.matcher: Matcher | None = None
+        self.seeker: Seeker | None = None
         self.database_path = ""
         self.reason = "no reference database: call /buildloc/reference/load"
         self.frames_unusable = 0
@@ -57,19 +57,19 @@ class Session:
         self.telemetry.reset()
         for flown in (self._frames, self._maps, self._keyframes):
             flown.clear()
-        if self.matcher is not None:
-            self.reason = WAITING
+        if self.seeker is not None:
+            self.seeker.reset()
 
     def load(self, path: str) -> bool:
         """Open a reference database; on failure there is none, and ``reason`` says why."""
-        self.database_path, self.matcher = path, None
+        self.database_path, self.seeker = path, None
         try:
             matcher = Matcher(open_database(Path(path), self.config), self.config)
             matcher.warm_up()
         except (BuildlocError, OSError) as error:
             self.reason = str(error)
             return False
-        self.matcher, self.reason = matcher, WAITING
+        self.seeker = Seeker(matcher)
         return True
 
     def add_mask(self, mask: Mask) -> Job | None:
@@ -100,6 +100,8 @@ class Session:
         """The keyframe poses that belong to the map of the last keyframe's stamp."""
         if not keyframes:
             return None
+        if self.seeker is not None:
+            self.seeker.carry(keyframes)
         stamp_ns = max(k.stamp_ns for k in keyframes)
         self._keyframes[stamp_ns] = keyframes
         return self._complete(stamp_ns)
@@ -116,20 +118,24 @@ class Session:
         return Job(self._maps.pop(stamp_ns), self._keyframes.pop(stamp_ns), seen)
 
     def solve(self, job: Job) -> Answer:
-        """Answer a job; keeps the reason when there is no fix."""
-        if self.matcher is None:
+        """Answer a job."""
+        if self.seeker is None:
             return Answer(NoFix(job.local_map.stamp_ns, self.reason), (), {})
-        answer = self.matcher.fix(job.local_map, job.keyframes, job.observations)
-        self.reason = answer.result.reason if isinstance(answer.result, NoFix) else "waiting for the next map"
-        return answer
+        return self.seeker.solve(job.local_map, job.keyframes, job.observations)
+
+    def locate(self, tracked: Tracked) -> Fix | NoFix:
+        """The fix of a tracked frame, or why there is none."""
+        if self.seeker is None:
+            return NoFix(tracked.stamp_ns, self.reason)
+        return self.seeker.locate(tracked)
 
     def waiting(self) -> NoFix:
         """No position right now, at the capture time of the latest image."""
         missing = self.telemetry.missing()
-        if self.matcher is None:
+        if self.seeker is None:
             reason = self.reason
         elif missing:
             reason = f"no {', '.join(missing)} received; check that it is published"
         else:
-            reason = self.telemetry_fault or self.reason
+            reason = self.telemetry_fault or self.seeker.reason
         return NoFix(self.latest_stamp_ns, reason)

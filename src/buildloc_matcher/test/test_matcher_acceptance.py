@@ -104,10 +104,9 @@ def test_the_threshold_follows_from_the_rate_asked_for() -> None:
 
 
 def test_each_figure_of_the_refinement_that_falls_short_is_named() -> None:
-    good = Refined(np.zeros(2), 0.0, 50, 40, 20, 2.0, 9.0)
+    good = Refined(np.zeros(2), 0.0, np.eye(3), {}, 50, 40, 20, 2.0)
     assert refuse_refined(good, CONFIG) is None
     for refined, text in (
-        (None, "found no buildings of the recent frames"),
         (replace(good, buildings=9), "matched 9 buildings, fewer than 10"),
         (replace(good, rms_m=11.0), "residuals of 11.0 m, above 10 m"),
     ):

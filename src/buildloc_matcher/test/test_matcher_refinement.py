@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from buildloc_matcher.config import matcher_config
 from buildloc_matcher.geometry import Similarity, fit_rigid, fit_similarity, rotation, wrap
-from buildloc_matcher.refinement import covariance_enu, horizontal_variance, observed_in_world, refine
+from buildloc_matcher.refinement import Refined, Unrefined, covariance_enu, horizontal_variance, refine
+from buildloc_matcher.window import make_window, placed, start
 from buildloc_msgs_py.types import FloatArray, FrameObservation, Keyframe
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -32,6 +33,11 @@ def frames_of(poses: list[Keyframe], noise_m: float = 0.3, seed: int = 1) -> lis
     return seen
 
 
+def refined_of(found: Refined | Unrefined) -> Refined:
+    assert isinstance(found, Refined), found
+    return found
+
+
 SEEN = frames_of(POSES)
 LAST = np.array([POSES[-1].x_m, POSES[-1].y_m])
 
@@ -46,9 +52,8 @@ def coarse(x_m: float, y_m: float, turn_deg: float) -> Similarity:
 @given(heading=st.floats(-3.2, 3.2), away=st.floats(0.0, 8.0), turn=st.floats(-1.5, 1.5))
 def test_a_shift_and_a_turn_are_recovered(heading: float, away: float, turn: float) -> None:
     # 8 m and 1.5 degrees over 380 m: within the 15 m in which the nearest building is mostly the right one.
-    start = coarse(away * math.cos(heading), away * math.sin(heading), turn)
-    refined = refine(start, POSES, SEEN, GROUND, DEFAULT)
-    assert refined is not None
+    begun = coarse(away * math.cos(heading), away * math.sin(heading), turn)
+    refined = refined_of(refine(begun, POSES, SEEN, GROUND, DEFAULT))
     # Noise of 0.3 m, averaged over hundreds of pairs.
     np.testing.assert_allclose(refined.position_m, LAST, atol=0.5)
     assert float(wrap(refined.yaw_rad - POSES[-1].yaw_rad)) == pytest.approx(0.0, abs=0.005)
@@ -59,52 +64,57 @@ def test_a_shift_and_a_turn_are_recovered(heading: float, away: float, turn: flo
 def test_the_paper_reaches_further() -> None:
     config = matcher_config({"preset": "paper"})
     assert (config.refine_distance_m, config.refine_frames) == (50.0, 20)
-    refined = refine(coarse(4.0, -3.0, 0.5), POSES, SEEN, GROUND, config)
-    assert refined is not None
+    refined = refined_of(refine(coarse(4.0, -3.0, 0.5), POSES, SEEN, GROUND, config))
     # Wrong pairs within 15 m stay in the last step and pull a little.
     np.testing.assert_allclose(refined.position_m, LAST, atol=1.5)
 
 
 def test_only_the_last_frames_with_a_pose_count() -> None:
     few = replace(DEFAULT, refine_frames=5)
-    refined = refine(coarse(2.0, 1.0, 0.2), POSES, SEEN, GROUND, few)
-    assert refined is not None and refined.observed == sum(len(s.centroids_m) for s in SEEN[-5:])
+    refined = refined_of(refine(coarse(2.0, 1.0, 0.2), POSES, SEEN, GROUND, few))
+    assert refined.observed == sum(len(s.centroids_m) for s in SEEN[-5:])
+    assert list(refined.poses) == [pose.stamp_ns for pose in POSES[-5:]]
+    np.testing.assert_array_equal(refined.poses[POSES[-1].stamp_ns][:2], refined.position_m)
     stray = [FrameObservation(99 * SECOND, np.zeros((50, 2)), 105.0), *SEEN[::-1]]
-    again = refine(coarse(2.0, 1.0, 0.2), POSES[::-1], stray, GROUND, few)
-    assert again is not None
+    again = refined_of(refine(coarse(2.0, 1.0, 0.2), POSES[::-1], stray, GROUND, few))
     np.testing.assert_allclose(again.position_m, refined.position_m, atol=1e-9)
 
 
 def test_frames_lie_in_the_world_where_the_coarse_pose_puts_them() -> None:
-    placed = observed_in_world(coarse(0.0, 0.0, 0.0), POSES, frames_of(POSES, 0.0), 20)
-    apart = np.hypot(*(placed[:, None] - CITY[None]).transpose(2, 0, 1)).min(axis=1)
-    assert len(placed) > 500 and apart.max() < 1e-9
-    assert observed_in_world(coarse(0, 0, 0), POSES, [], 20).shape == (0, 2)
+    points = placed(make_window(POSES, frames_of(POSES, 0.0)), start(coarse(0.0, 0.0, 0.0), POSES))
+    apart = np.hypot(*(points[:, None] - CITY[None]).transpose(2, 0, 1)).min(axis=1)
+    assert len(points) > 500 and apart.max() < 1e-9
+    assert len(make_window(POSES, []).level_m) == 0
 
 
 def test_what_gives_no_refined_pose() -> None:
-    start = coarse(1.0, 1.0, 0.0)
-    assert refine(start, [], SEEN, GROUND, DEFAULT) is None
-    assert refine(start, POSES, [], GROUND, DEFAULT) is None
+    begun = coarse(1.0, 1.0, 0.0)
     two = [FrameObservation(SEEN[-1].stamp_ns, SEEN[-1].centroids_m[:2], 105.0)]
-    assert refine(start, POSES, two, GROUND, DEFAULT) is None
-    assert refine(start, POSES, SEEN, alike(CITY + 5000.0), DEFAULT) is None
     one_house = alike(np.array([[9e3, 9e3], LAST]))
-    assert refine(start, POSES, SEEN[-1:], one_house, DEFAULT) is None
+    for arguments in (
+        ([], SEEN, GROUND), (POSES, [], GROUND), (POSES, two, GROUND), (POSES, SEEN, alike(CITY + 5000.0)),
+        (POSES, SEEN[-1:], one_house),
+    ):  # fmt: skip
+        none = refine(begun, *arguments, DEFAULT)
+        assert isinstance(none, Unrefined) and "found no buildings of the recent frames" in none.reason
 
 
-def test_the_covariance_is_never_better_than_its_floor_and_grows_with_the_lever() -> None:
-    refined = refine(coarse(1.0, 1.0, 0.1), POSES, SEEN, GROUND, DEFAULT)
-    assert refined is not None
-    covariance = covariance_enu(refined, DEFAULT)
-    assert np.all(np.diag(covariance)[:2] == DEFAULT.sigma_floor_m**2)
-    assert covariance[2, 2] == DEFAULT.sigma_up_m**2 and np.count_nonzero(covariance) == 3
+def test_the_covariance_counts_the_registration_of_the_reference() -> None:
+    begun, registered = coarse(1.0, 1.0, 0.1), replace(DEFAULT, sigma_registration_m=0.0)
+    exact = refined_of(refine(begun, POSES, SEEN, GROUND, registered))
+    refined = refined_of(refine(begun, POSES, SEEN, GROUND, DEFAULT))
+    np.testing.assert_allclose(refined.covariance - exact.covariance, np.diag([2.25, 2.25, 0.0]), atol=1e-12)
+    covariance = covariance_enu(refined.covariance, DEFAULT)
+    np.testing.assert_array_equal(covariance[:2, :2], refined.covariance[:2, :2])
+    assert covariance[2, 2] == DEFAULT.sigma_up_m**2 and not covariance[2, :2].any()
+
+
+def test_the_variance_of_a_map_grows_with_the_lever() -> None:
     square = np.array([[-10.0, -10.0], [10.0, -10.0], [10.0, 10.0], [-10.0, 10.0]])
-    # 4 buildings, residuals of 4 m: 16 / 2 times (1 + lever^2 / 200), times the inflation of 2 squared.
-    for lever, expected in ((0.0, 32.0), (20.0, 96.0)):
-        variance = horizontal_variance(np.array([lever, 0.0]), square, 4.0, DEFAULT)
-        assert variance == pytest.approx(expected)
-    assert horizontal_variance(np.zeros(2), square, 0.1, DEFAULT) == DEFAULT.sigma_floor_m**2
+    config = replace(DEFAULT, sigma_registration_m=1.0)
+    # 4 buildings, residuals of 4 m: 16 / 2 times (1 + lever^2 / 200), and 1 of the registration.
+    for lever, expected in ((0.0, 9.0), (20.0, 25.0)):
+        assert horizontal_variance(np.array([lever, 0.0]), square, 4.0, config) == pytest.approx(expected)
 
 
 @settings(max_examples=50, deadline=None)

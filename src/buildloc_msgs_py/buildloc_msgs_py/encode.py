@@ -30,13 +30,13 @@ from buildloc_msgs_py.types import (
     CameraModel,
     Candidate,
     Fix,
-    FloatArray,
     Keyframe,
     LocalMap,
     Mask,
     NoFix,
+    Tracked,
 )
-from buildloc_msgs_py.wire import CANDIDATE_ROW, MAP_ROW, POINT_TYPES
+from buildloc_msgs_py.wire import CANDIDATE_ROW, MAP_ROW, POINT_TYPES, TRACKED_AXES
 
 LEVEL_SIGMA_RAD = math.radians(5.0)
 
@@ -115,17 +115,17 @@ def encode_keyframes(keyframes: Sequence[Keyframe]) -> Path:
     return path
 
 
-def encode_tracked(pose: Keyframe, height_m: float, covariance: FloatArray) -> PoseWithCovarianceStamped:
-    """A frame's pose in ``buildloc_map``, ``height_m`` above ground at unit scale; its (4, 4) covariance is
-    over x, y, yaw and log scale. Roll and pitch are the gimbal's, which are taken out."""
-    message = PoseWithCovarianceStamped(header=header(pose.stamp_ns, topics.FRAME_MAP))
-    height = height_m * pose.scale
-    message.pose.pose.position.x, message.pose.pose.position.y = float(pose.x_m), float(pose.y_m)
-    message.pose.pose.position.z = float(height)
-    message.pose.pose.orientation = _yaw_quaternion(pose.yaw_rad)
-    to_message = np.zeros((6, 4))  # x, y, z, and turns about the three axes
-    to_message[[0, 1, 2, 5], [0, 1, 3, 2]] = 1.0, 1.0, height, 1.0
-    spread = to_message @ covariance @ to_message.T
+def encode_tracked(tracked: Tracked) -> PoseWithCovarianceStamped:
+    """A frame's pose in the level camera frame of its keyframe, z the height above ground. Roll and pitch
+    are the gimbal's, which are taken out."""
+    frame_id = f"{topics.FRAME_KEYFRAME}/{tracked.keyframe_ns}"
+    message = PoseWithCovarianceStamped(header=header(tracked.stamp_ns, frame_id))
+    position = message.pose.pose.position
+    position.x, position.y, position.z = float(tracked.x_m), float(tracked.y_m), float(tracked.height_m)
+    message.pose.pose.orientation = _yaw_quaternion(tracked.yaw_rad)
+    spread = np.zeros((6, 6))  # over x, y, z, and turns about the three axes
+    scaled = np.diag([1.0, 1.0, 1.0, tracked.height_m])
+    spread[np.ix_(TRACKED_AXES, TRACKED_AXES)] = scaled @ tracked.covariance @ scaled
     spread[3, 3] = spread[4, 4] = LEVEL_SIGMA_RAD**2
     message.pose.covariance = [float(v) for v in spread.ravel()]
     return message
@@ -183,7 +183,7 @@ def encode_fix(fix: Fix | NoFix) -> NavSatFix:
 
 
 def encode_pose(fix: Fix) -> PoseWithCovarianceStamped:
-    """The fix in the metric world frame (UTM easting, northing) with its heading."""
+    """The fix in the metric world frame (UTM easting, northing) with its heading; a wide one if unknown."""
     msg = PoseWithCovarianceStamped(header=header(fix.stamp_ns, topics.FRAME_WORLD))
     msg.pose.pose.position.x = float(fix.easting_m)
     msg.pose.pose.position.y = float(fix.northing_m)
@@ -192,5 +192,7 @@ def encode_pose(fix: Fix) -> PoseWithCovarianceStamped:
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = fix.covariance_enu_m2
     covariance[3, 3] = covariance[4, 4] = covariance[5, 5] = LEVEL_SIGMA_RAD**2
+    if math.isfinite(fix.yaw_variance_rad2):
+        covariance[5, 5] = fix.yaw_variance_rad2
     msg.pose.covariance = [float(v) for v in covariance.ravel()]
     return msg

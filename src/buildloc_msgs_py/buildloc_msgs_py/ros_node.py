@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+from collections import deque
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import rclpy
@@ -23,6 +25,7 @@ from buildloc_msgs_py.pairing import FrameFault, FramePairing
 from buildloc_msgs_py.types import Frame
 
 ConfigT = TypeVar("ConfigT")
+Result = TypeVar("Result")
 DIAGNOSTICS_PERIOD_S = 1.0
 FLUSH_PERIOD_S = 0.5
 
@@ -92,6 +95,40 @@ class Diagnostics:
 
 def _text(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+class Worker:
+    """Does one thing after another on a thread of its own, so that messages keep being received; what came
+    of each is told on the node's executor, in order."""
+
+    def __init__(self, node: Node, name: str) -> None:
+        self._name = name
+        self._pool = ThreadPoolExecutor(1, name)
+        self._done: deque[Callable[[], None]] = deque()
+        self._finished = node.create_guard_condition(self._on_finished)
+
+    def submit(self, work: Callable[[], Result], tell: Callable[[Future[Result]], None]) -> None:
+        """Do ``work``, then ``tell`` its future, which is done."""
+
+        def finished(future: Future[Result]) -> None:
+            self._done.append(lambda: tell(future))
+            self._finished.trigger()
+
+        self._pool.submit(work).add_done_callback(finished)
+
+    def _on_finished(self) -> None:
+        while self._done:
+            self._done.popleft()()
+
+    def forget(self) -> None:
+        """End what runs, give up what waits; nothing of it is told."""
+        self.shutdown()
+        self._pool = ThreadPoolExecutor(1, self._name)
+        self._done.clear()
+
+    def shutdown(self) -> None:
+        """End what runs, give up what waits."""
+        self._pool.shutdown(wait=True, cancel_futures=True)
 
 
 class FrameAssembler:

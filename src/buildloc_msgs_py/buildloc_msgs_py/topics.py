@@ -20,5 +20,6 @@ DIAGNOSTICS = "/diagnostics"
 GROUND_TRUTH = "/ground_truth/pose"
 
 FRAME_MAP = "buildloc_map"
+FRAME_KEYFRAME = "buildloc_keyframe"  # and "/" and the stamp of the keyframe, ns
 FRAME_WORLD = "map"
 FRAME_CAMERA = "camera"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,6 +69,24 @@ class Keyframe:
     y_m: float
     yaw_rad: float
     scale: float = 1.0
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """Where a frame is in a keyframe: below the camera, in the level camera frame of the keyframe.
+
+    Metres are those of the keyframe's altimeter; its scale in the map is not in them, ``height_m`` above
+    ground included. ``covariance`` (4, 4) is that of the registration alone, over x, y, yaw and the
+    logarithm of the height.
+    """
+
+    stamp_ns: int
+    keyframe_ns: int
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    height_m: float
+    covariance: FloatArray
 
 
 @dataclass(frozen=True)
@@ -142,7 +161,8 @@ class Candidate:
 class Fix:
     """An accepted position of the camera at ``stamp_ns`` (the image's capture time).
 
-    ``covariance_enu_m2`` is (3, 3) east, north, up. ``yaw_rad`` is the ENU heading of image-right.
+    ``covariance_enu_m2`` is (3, 3) east, north, up. ``yaw_rad`` is the ENU heading of image-right, and
+    ``yaw_variance_rad2`` its variance, NaN where it is not known.
     """
 
     stamp_ns: int
@@ -153,6 +173,7 @@ class Fix:
     northing_m: float
     yaw_rad: float
     covariance_enu_m2: FloatArray
+    yaw_variance_rad2: float = math.nan
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from buildloc_msgs_py import topics
 from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.footprint import SHAPE_METRICS
 from buildloc_msgs_py.types import (
@@ -23,6 +24,7 @@ from buildloc_msgs_py.types import (
     LocalMap,
     Mask,
     NoFix,
+    Tracked,
 )
 
 # One row per building. x, y, z are float32, and z (0) is there, because RViz draws no other clouds; a
@@ -42,6 +44,7 @@ CANDIDATE_ROW = np.dtype([(name, "<f8") for name in CANDIDATE_FIELDS])
 # Types of PointField's datatype.
 POINT_TYPES = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 8: "<f8"}
 STATUS_NO_FIX = -1
+TRACKED_AXES = (0, 1, 5, 2)  # x, y, yaw and z in the (6, 6) covariance of a pose
 
 
 class WireError(BuildlocError):
@@ -207,6 +210,23 @@ def decode_fix(msg: Any) -> Fix | NoFix:
     return Fix(
         stamp_ns(msg), float(msg.latitude), float(msg.longitude), float(msg.altitude),
         math.nan, math.nan, math.nan, covariance,
+    )  # fmt: skip
+
+
+def decode_tracked(msg: Any) -> Tracked:
+    """A tracked frame of a geometry_msgs/PoseWithCovarianceStamped; WireError when it names no keyframe."""
+    frame, _, keyframe = str(msg.header.frame_id).rpartition("/")
+    if frame != topics.FRAME_KEYFRAME or not keyframe.isdecimal():
+        raise WireError(
+            f"tracked pose is in frame {msg.header.frame_id!r}, not in that of a keyframe; "
+            "feed /buildloc/track from the mapper"
+        )
+    position, spread = msg.pose.pose.position, np.reshape(msg.pose.covariance, (6, 6))
+    height = float(position.z)
+    scaled = np.diag([1.0, 1.0, 1.0, 1.0 / height])
+    return Tracked(
+        stamp_ns(msg), int(keyframe), float(position.x), float(position.y), _yaw(msg.pose.pose.orientation),
+        height, scaled @ spread[np.ix_(TRACKED_AXES, TRACKED_AXES)] @ scaled,
     )  # fmt: skip
 
 

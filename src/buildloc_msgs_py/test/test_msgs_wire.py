@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from buildloc_msgs_py import encode, wire
-from buildloc_msgs_py.types import CameraModel, Candidate, Fix, Keyframe, LocalMap, Mask, NoFix
+from buildloc_msgs_py.types import CameraModel, Candidate, Fix, Keyframe, LocalMap, Mask, NoFix, Tracked
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import PointField
@@ -221,17 +221,21 @@ def test_no_fix_has_no_position(travel: Travel) -> None:
 @wires
 def test_tracked(travel: Travel) -> None:
     spread = np.random.default_rng(2).normal(size=(4, 4)) * 0.1
-    covariance = spread @ spread.T  # x, y, yaw, log scale
-    message = travel(encode.encode_tracked(Keyframe(STAMP, 12.0, -3.0, 0.5, 1.02), 100.0, covariance))
-    assert (wire.stamp_ns(message), message.header.frame_id) == (STAMP, "buildloc_map")
-    position, turn = message.pose.pose.position, message.pose.pose.orientation
-    assert (position.x, position.y, position.z) == pytest.approx((12.0, -3.0, 102.0))
-    assert 2.0 * np.arctan2(turn.z, turn.w) == pytest.approx(0.5)
+    tracked = Tracked(STAMP, STAMP - 7, 12.0, -3.0, 0.5, 102.0, spread @ spread.T)
+    message = travel(encode.encode_tracked(tracked))
+    assert message.header.frame_id == f"buildloc_keyframe/{STAMP - 7}"
     six = np.reshape(message.pose.covariance, (6, 6))
-    assert six[:2, :2] == pytest.approx(covariance[:2, :2])
-    assert six[5, 5] == pytest.approx(covariance[2, 2]) and six[0, 5] == pytest.approx(covariance[0, 2])
-    assert six[2, 2] == pytest.approx(102.0**2 * covariance[3, 3])
+    assert six[5, 5] == pytest.approx(tracked.covariance[2, 2])
+    assert six[2, 2] == pytest.approx(102.0**2 * tracked.covariance[3, 3])
     assert np.linalg.eigvalsh(six).min() > -1e-9
+    received = wire.decode_tracked(message)
+    assert (received.stamp_ns, received.keyframe_ns) == (STAMP, STAMP - 7)
+    pose = (received.x_m, received.y_m, received.yaw_rad, received.height_m)
+    assert pose == pytest.approx((12.0, -3.0, 0.5, 102.0))
+    assert received.covariance == pytest.approx(tracked.covariance)
+    message.header.frame_id = "buildloc_map"
+    with pytest.raises(wire.WireError, match="in frame 'buildloc_map', not in that of a keyframe"):
+        wire.decode_tracked(message)
 
 
 @wires
@@ -240,3 +244,5 @@ def test_pose(travel: Travel) -> None:
     assert message.header.frame_id == "map"
     assert wire.decode_pose(message) == pytest.approx((317000.5, 4701000.25, 0.7))
     assert np.array_equal(np.reshape(message.pose.covariance, (6, 6))[:3, :3], FIX.covariance_enu_m2)
+    surer = encode.encode_pose(replace(FIX, yaw_variance_rad2=1e-4))
+    assert surer.pose.covariance[35] == 1e-4 < message.pose.covariance[35]

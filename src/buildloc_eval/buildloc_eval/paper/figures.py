@@ -18,6 +18,7 @@ from buildloc_msgs_py.types import FloatArray
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from buildloc_eval.paper.methods import Prediction
 from buildloc_eval.segmentation_errors import Outlines
@@ -28,11 +29,12 @@ SHOWN = 3
 
 @dataclass(frozen=True)
 class Trace:
-    """Rank of the true bin after 1, 2, ... keyframes of a flight, and where it is stably the first."""
+    """Ranks (S, N) of the true bin after 1 to N keyframes of a flight in S seeds, and the median of where it
+    is stably the first; None where one of them never gets there."""
 
-    flight: int
-    ranks: Sequence[int]
-    stable: int | None
+    flight: str
+    ranks: NDArray[np.int64]
+    stable: float | None
 
 
 def _save(figure: Figure, path: Path) -> Path:
@@ -50,25 +52,28 @@ def _ground(axes: Axes, outlines: Outlines, centre_m: FloatArray, half_m: float)
 
 
 def draw_trajectories(
-    path: Path, reference: Mapping[int, Outlines], paths_m: Mapping[int, FloatArray]
+    path: Path, reference: Mapping[str, Outlines], paths_m: Mapping[str, FloatArray]
 ) -> Path:
     """Every flight's true path over the reference around it."""
     figure, panels = plt.subplots(1, len(paths_m), figsize=(3.2 * len(paths_m), 3.5), squeeze=False)
-    for axes, (number, flown) in zip(panels[0], paths_m.items(), strict=True):
+    for axes, (name, flown) in zip(panels[0], paths_m.items(), strict=True):
         centre = 0.5 * (flown.min(axis=0) + flown.max(axis=0))
-        _ground(axes, reference[number], centre, VIEW_M)
+        _ground(axes, reference[name], centre, VIEW_M)
         axes.plot(*(flown - centre).T, "tab:blue", lw=1.5)
         axes.plot(*(flown[0] - centre), "o", color="tab:green")
-        axes.set_title(f"flight {number}")
+        axes.set_title(name)
     return _save(figure, path)
 
 
 def draw_convergence(path: Path, traces: Sequence[Trace], radius_km: int, bins: int) -> Path:
-    """Rank against keyframes, a star where it is stably the first."""
+    """Rank against keyframes, median over the seeds and what lies between the quartiles; a star where it is
+    stably the first."""
     figure, axes = plt.subplots(figsize=(9, 4.8))
     for trace in traces:
-        keyframes = np.arange(1, len(trace.ranks) + 1)
-        (line,) = axes.plot(keyframes, trace.ranks, lw=1.2, label=f"flight {trace.flight}")
+        keyframes = np.arange(1, trace.ranks.shape[1] + 1)
+        low, median, high = np.percentile(trace.ranks, (25, 50, 75), axis=0)
+        (line,) = axes.plot(keyframes, median, lw=1.2, label=trace.flight)
+        axes.fill_between(keyframes, low, high, alpha=0.15, color=line.get_color(), lw=0)
         if trace.stable is not None:
             axes.plot(trace.stable, 1, "*", ms=13, color=line.get_color())
     axes.set(

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from buildloc_msgs_py.errors import BuildlocError
@@ -33,6 +34,46 @@ class SiteError(BuildlocError):
     """No place is left for a flight."""
 
 
+class Course(Protocol):
+    """How far is flown, how high, and with how many keyframes."""
+
+    @property
+    def length_km(self) -> float:
+        """Of the path."""
+
+    @property
+    def altitude_m(self) -> float:
+        """Above ground."""
+
+    @property
+    def keyframes(self) -> int:
+        """Their number, or about."""
+
+
+class Flight(Protocol):
+    """A flight of any part of the experiments."""
+
+    @property
+    def name(self) -> str:
+        """Of its files."""
+
+    @property
+    def like(self) -> Course:
+        """What is flown."""
+
+
+class PlacedFlight(Flight, Protocol):
+    """A flight whose place is the same for every seed."""
+
+    @property
+    def number(self) -> int:
+        """Tells the flights of a part apart."""
+
+    @property
+    def centre_m(self) -> tuple[float, float]:
+        """East and north."""
+
+
 @dataclass(frozen=True)
 class PaperFlight:
     """A row of the paper's flight table, flown over ``centre_m`` (east, north)."""
@@ -44,6 +85,11 @@ class PaperFlight:
     def number(self) -> int:
         """That of the paper."""
         return self.like.number
+
+    @property
+    def name(self) -> str:
+        """Of its files."""
+        return f"flight{self.number}"
 
 
 # What choose() finds in the footprints of boston_osm.parquet with seed 1.
@@ -58,8 +104,8 @@ CENTRES_M = (
 )
 
 
-def flight_config(like: PublishedFlight) -> FlightConfig:
-    """Camera of a DJI Mini 4K at reduced resolution; the speed that makes the paper's number of keyframes."""
+def flight_config(like: Course) -> FlightConfig:
+    """Camera of a DJI Mini 4K at reduced resolution; the speed that makes the number of keyframes."""
     length = 1000.0 * like.length_km
     return FlightConfig(
         length_m=length, leg_m=(length - (_legs(like) - 1) * SPACING_M) / _legs(like),
@@ -69,11 +115,11 @@ def flight_config(like: PublishedFlight) -> FlightConfig:
     )  # fmt: skip
 
 
-def _legs(like: PublishedFlight) -> int:
+def _legs(like: Course) -> int:
     return max(1, round(1000.0 * like.length_km / (LEG_M + SPACING_M)))
 
 
-def trajectory(flight: PaperFlight, seed: int) -> Trajectory:
+def trajectory(flight: PlacedFlight, seed: int) -> Trajectory:
     """Legs back and forth about the centre; what the wind does is by the seed."""
     config = flight_config(flight.like)
     margin = margin_m(config) + SLACK_M
@@ -84,8 +130,8 @@ def trajectory(flight: PaperFlight, seed: int) -> Trajectory:
     return fly((x - reach[0], y - reach[1], x + reach[0], y + reach[1]), config, seed)
 
 
-def keyframe_stamps(flight: PaperFlight, flown: Trajectory) -> NDArray[np.int64]:
-    """(N,) as many as the paper's flight had, evenly over the flight."""
+def keyframe_stamps(flight: Flight, flown: Trajectory) -> NDArray[np.int64]:
+    """(N,) as many as the flight is to have, evenly over it."""
     first, last = int(flown.stamps_ns[0]), int(flown.stamps_ns[-1])
     return np.linspace(first, last, flight.like.keyframes).astype(np.int64)
 

@@ -7,7 +7,7 @@ the ground's texture. So the poses of a flight are computed once and its maps fo
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -33,6 +33,9 @@ from buildloc_msgs_py.types import (
 from buildloc_eval.camera import attitude, camera_model, photograph, world_to_rays
 from buildloc_eval.flight import FlightConfig, Trajectory
 from buildloc_eval.paper.brm import coverage, regions
+from buildloc_eval.paper.flights import PlacedFlight, flight_config, keyframe_stamps, trajectory
+from buildloc_eval.paper.texture import ground_texture
+from buildloc_eval.realworld import data_folder
 from buildloc_eval.segmentation_errors import Outlines, SegmentationErrors, perceive
 from buildloc_eval.world import Surface
 
@@ -119,11 +122,31 @@ def register(
     taken: tuple[Shot, ...], world: Surface, flight: FlightConfig, config: MapperConfig, seed: int
 ) -> Track:
     """Photograph the ground at every keyframe and let the mapper link them."""
-    rng, camera, atlas = np.random.default_rng([seed, 2]), camera_model(flight), Atlas(config)
-    poses: list[dict[int, Similarity] | None] = []
+    return link(taken, frames(taken, world, flight, seed), camera_model(flight), config)
+
+
+def fly_textured(flight: PlacedFlight, config: MapperConfig, seed: int) -> Track:
+    """Fly over textured ground and register every keyframe."""
+    limit_threads()
+    flying, flown = flight_config(flight.like), trajectory(flight, seed)
+    taken = shots(flown, keyframe_stamps(flight, flown).tolist(), flying, seed)
+    ground = ground_texture(data_folder(), flight, np.random.default_rng([seed, 6]))
+    return register(taken, ground, flying, config, seed)
+
+
+def frames(taken: Sequence[Shot], world: Surface, flight: FlightConfig, seed: int) -> Iterator[Frame]:
+    """The ground as the camera sees it at every keyframe."""
+    rng, camera = np.random.default_rng([seed, 2]), camera_model(flight)
     for shot in taken:
         image = photograph(world, camera, shot.true_pose, shot.true_attitude_xyzw, flight, rng)
-        keyframe = atlas.add(shot.frame(camera, image))
+        yield shot.frame(camera, image)
+
+
+def link(taken: tuple[Shot, ...], seen: Iterable[Frame], camera: CameraModel, config: MapperConfig) -> Track:
+    """Let the mapper link the frames of the keyframes."""
+    atlas, poses = Atlas(config), list[dict[int, Similarity] | None]()
+    for frame in seen:
+        keyframe = atlas.add(frame)
         linked = atlas.submap(keyframe).poses
         poses.append(None if keyframe > 0 and len(linked) == 1 else dict(linked))
     return Track(camera, taken, tuple(poses))

@@ -4,31 +4,32 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from buildloc_matcher.config import matcher_config
 from buildloc_matcher.matcher import Matcher, MatchResult
 from buildloc_matcher.reference.buildings import Buildings
 from buildloc_matcher.reference.database import ReferenceDatabase, assemble
-from buildloc_matcher.refinement import refine
+from buildloc_matcher.refinement import Refined, refine
 from buildloc_matcher.session import frames_kept
 from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.types import FloatArray
 from numpy.typing import NDArray
 
+from buildloc_eval.generators import method
 from buildloc_eval.paper import brm
 from buildloc_eval.paper.flights import EPSG
 from buildloc_eval.paper.flown import Maps, Snapshot
-from buildloc_eval.scale import method
 
-# How the method is called here -> in eval scale. The second is the paper's "Ours".
+# How the method is called here -> in generators. The second is the paper's "Ours".
 STARS = {
     "default preset": "default",
     "paper preset": "paper",
     "without shape": "shape-free 8-D",
 }
 BRM = "BRM"
+METHODS = (BRM, *reversed(STARS))
 # What stands in the paper's table where these stand in ours.
 PUBLISHED = {
     "default preset": "ours",
@@ -63,10 +64,12 @@ def nothing(reason: str) -> Prediction:
     return Prediction(none, none, None, none.astype(np.int32), None, reason, {}, {})
 
 
-def reference_within(buildings: Buildings, centre_m: FloatArray, radius_km: float) -> ReferenceDatabase:
+def reference_within(
+    buildings: Buildings, centre_m: FloatArray, radius_km: float, epsg: int = EPSG
+) -> ReferenceDatabase:
     """The database of a search radius, in memory."""
     inside = np.hypot(*(buildings.centroids_m - centre_m).T) <= 1000.0 * radius_km
-    return assemble(EPSG, buildings.select(inside), matcher_config())
+    return assemble(epsg, buildings.select(inside), matcher_config())
 
 
 def make_matcher(name: str, database: ReferenceDatabase) -> Matcher:
@@ -95,19 +98,23 @@ def locate(matcher: Matcher, maps: Maps, keyframes: int, final: bool) -> Predict
         found = matcher.locate(snapshot.local_map)
     except BuildlocError as error:
         return nothing(str(error))
+    ranked = ranking(matcher, found)
+    if not (final and found.candidates):
+        return ranked
+    started = time.perf_counter()
+    refined = _refined(matcher, found, maps, snapshot, keyframes)
+    seconds = {**ranked.seconds, "refine": time.perf_counter() - started}
+    return replace(ranked, final_m=refined, seconds=seconds)
+
+
+def ranking(matcher: Matcher, found: MatchResult) -> Prediction:
+    """What a matcher has found, without a refined place."""
     if found.query is None:
         return nothing("map has fewer than four buildings")
     kept = np.array([[c.x_m, c.y_m, c.yaw_rad, c.scale] for c in found.candidates[:KEPT]]).reshape(-1, 4)
     centre, bins = found.query.points_m.mean(axis=0), ranked_bins(found, matcher.config.bin_size_m)
-    seconds = dict(found.seconds)
-    refined = None
-    if final and found.candidates:
-        started = time.perf_counter()
-        refined = _refined(matcher, found, maps, snapshot, keyframes)
-        seconds["refine"] = time.perf_counter() - started
-    return Prediction(
-        kept[:, :2], kept[:, 2:], centre, bins, refined, matcher.judge(found).reason, seconds, found.funnel
-    )  # fmt: skip
+    refused, seconds = matcher.judge(found).reason, dict(found.seconds)
+    return Prediction(kept[:, :2], kept[:, 2:], centre, bins, None, refused, seconds, found.funnel)
 
 
 def _refined(
@@ -117,7 +124,7 @@ def _refined(
     coarse = matcher.place(found, np.array([last.x_m, last.y_m]))
     seen = maps.observations[:keyframes][-frames_kept(matcher.config) :]
     refined = refine(coarse, snapshot.keyframes, seen, matcher.database.ground, matcher.config)
-    return None if refined is None else refined.position_m
+    return refined.position_m if isinstance(refined, Refined) else None
 
 
 def brm_survivors(reference: brm.RatioMap, maps: Maps) -> tuple[brm.Survivors, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,8 @@ from buildloc_matcher.config import matcher_config
 
 from buildloc_eval.observation import Digitiser
 from buildloc_eval.paper.differences import AutomaticMapping
-from buildloc_eval.paper.flights import PaperFlight
+from buildloc_eval.paper.flights import Flight, PaperFlight
+from buildloc_eval.paper.methods import METHODS
 from buildloc_eval.paper.published import LARGE_RADII_KM, RADII_KM
 from buildloc_eval.paper.store import Store
 from buildloc_eval.sections import source_digest
@@ -29,26 +31,28 @@ TRACK_CODE = (
 )  # fmt: skip
 MAP_CODE = (*TRACK_CODE, *GROUND_CODE, f"{PAPER}.brm", "buildloc_eval.segmentation_errors")
 PREDICTION_CODE = (
-    *MAP_CODE, "buildloc_matcher", "buildloc_eval.generators", "buildloc_eval.scale", f"{PAPER}.methods"
+    *MAP_CODE, "buildloc_matcher", "buildloc_eval.generators", f"{PAPER}.methods"
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is run: numbers of the paper's flights, seeds of each, radii; of which methods every prefix is
-    located, at which radii and for how many seeds."""
+    """What is run of a part: flights by their names, seeds of each, radii; of which methods every prefix is
+    located, at which radii and for how many seeds; the methods."""
 
-    flights: tuple[int, ...]
+    flights: tuple[str, ...]
     seeds: int
     radii_km: tuple[int, ...]
     prefixes: dict[str, tuple[int, ...]]
     prefix_seeds: int
+    methods: tuple[str, ...] = METHODS
 
 
 FULL = Plan(
-    (1, 2, 3, 4, 5, 6, 7), 10, RADII_KM, {"default preset": LARGE_RADII_KM, "paper preset": (6,)}, 1
+    tuple(f"flight{n}" for n in range(1, 8)), 10, RADII_KM,
+    {"default preset": LARGE_RADII_KM, "paper preset": LARGE_RADII_KM}, 10
 )  # fmt: skip
-QUICK = Plan((1, 2), 2, (1, 6, 12), {"default preset": (6,)}, 1)
+QUICK = Plan(("flight1", "flight2"), 2, (1, 6, 12), {"default preset": (6,), "paper preset": (6,)}, 2)
 
 
 @dataclass(frozen=True)
@@ -87,18 +91,28 @@ def measured_models() -> Models:
 
 
 class Stores:
-    """One folder per stage. Each is refused when an earlier stage's configuration or code has changed."""
+    """One folder per stage. Each is refused when an earlier stage's configuration or code has changed.
 
-    def __init__(self, out: Path, seed: int, models: Models) -> None:
+    ``also`` and ``code``: what a part depends on besides, and its own modules.
+    """
+
+    def __init__(
+        self, out: Path, seed: int, models: Models, also: Mapping[str, Any] = {}, code: Sequence[str] = ()
+    ) -> None:
         said = {name: value for name, value in asdict(models).items() if name != "mapper"}
-        ground = {"seed": seed, "digitiser": said.pop("digitiser"), "automatic": said.pop("automatic")}
-        track = {"seed": seed, "mapper": asdict(models.mapper)}
+        ground = {
+            "seed": seed,
+            "digitiser": said.pop("digitiser"),
+            "automatic": said.pop("automatic"),
+            **also,
+        }
+        track = {"seed": seed, "mapper": asdict(models.mapper), **also}
         matchers = {name: asdict(matcher_config({"preset": name})) for name in ("default", "paper")}
-        self.ground = Store(out / "ground", _plain(ground | {"code": source_digest(GROUND_CODE)}))
-        self.tracks = Store(out / "tracks", _plain(track | {"code": source_digest(TRACK_CODE)}))
+        self.ground = Store(out / "ground", _plain(ground | {"code": source_digest((*GROUND_CODE, *code))}))
+        self.tracks = Store(out / "tracks", _plain(track | {"code": source_digest((*TRACK_CODE, *code))}))
         maps = ground | track | said
-        self.maps = Store(out / "maps", _plain(maps | {"code": source_digest(MAP_CODE)}))
-        predictions = maps | {"matchers": matchers, "code": source_digest(PREDICTION_CODE)}
+        self.maps = Store(out / "maps", _plain(maps | {"code": source_digest((*MAP_CODE, *code))}))
+        predictions = maps | {"matchers": matchers, "code": source_digest((*PREDICTION_CODE, *code))}
         self.predictions = Store(out / "predictions", _plain(predictions))
 
 
@@ -107,12 +121,12 @@ def _plain(values: dict[str, Any]) -> dict[str, Any]:
     return dict(json.loads(json.dumps(values)))
 
 
-def maps_name(flight: PaperFlight, seed: int) -> str:
+def maps_name(flight: Flight, seed: int) -> str:
     """Of the maps of a flight and a seed."""
-    return f"flight{flight.number}_seed{seed}"
+    return f"{flight.name}_seed{seed}"
 
 
-def prediction_name(method: str, radius_km: float, flight: PaperFlight, seed: int, prefixes: bool) -> str:
+def prediction_name(method: str, radius_km: float, flight: Flight, seed: int, prefixes: bool) -> str:
     """Of a prediction, or of those of all prefixes."""
     kind = "prefixes" if prefixes else "whole"
     return f"{kind}_{method.replace(' ', '_')}_{radius_km:g}km_{maps_name(flight, seed)}"

@@ -19,9 +19,9 @@ from buildloc_msgs_py.types import FloatArray
 from buildloc_eval.html import write_report
 from buildloc_eval.machine import machine
 from buildloc_eval.paper import figures
-from buildloc_eval.paper.flights import PaperFlight
+from buildloc_eval.paper.flights import Flight, PaperFlight
 from buildloc_eval.paper.flown import Maps, true_place
-from buildloc_eval.paper.methods import BRM, PUBLISHED, Prediction
+from buildloc_eval.paper.methods import BRM, METHODS, PUBLISHED, Prediction
 from buildloc_eval.paper.plan import Models, Plan, Stores, maps_name, outlines_of, prediction_name
 from buildloc_eval.paper.published import (
     CORRECT_M,
@@ -38,13 +38,18 @@ from buildloc_eval.paper.scoring import (
     bins_within,
     error_row,
     first_and_stable,
+    mean_interval,
     recall_row,
     score,
 )
 from buildloc_eval.segmentation_errors import Outlines
 
 OURS = "default preset"
-METHODS = (BRM, "without shape", "paper preset", OURS)
+# What the report shows of a solve's funnel, in the order of the stages.
+FUNNEL = (
+    "buildings", "stars", "matches", "hypotheses", "voters", "clusters", "rescored", "looks", "log_odds",
+    "lead", "score",
+)  # fmt: skip
 REAL = [
     "real: the footprints (greater Boston, OpenStreetMap 2021) and the ground's texture (orthophotos of "
     "Barnarp and Banepa, mirrored); registration, mapping, matching and refinement are the system's own",
@@ -57,29 +62,45 @@ NOT_DONE = ["NetVLAD has not been run: the paper's figures stand alone in its ro
 
 
 @dataclass(frozen=True)
+class Chapter:
+    """A part of the report: what it says, its bars and its pictures."""
+
+    title: str
+    said: dict[str, Any]
+    bars: list[dict[str, Any]]
+    pictures: list[tuple[str, Path]]
+
+
+@dataclass(frozen=True)
 class Trial:
     """A scored whole flight."""
 
     method: str
     radius_km: int
-    flight: int
+    flight: str
     seed: int
     score: Score
-    seconds: dict[str, float]
+    prediction: Prediction
 
 
-def trials(stores: Stores, flights: Sequence[PaperFlight], plan: Plan, seed: int) -> list[Trial]:
+def trials(stores: Stores, flights: Sequence[Flight], plan: Plan, seed: int) -> list[Trial]:
     """Every whole flight of a plan, scored."""
     found = []
     for flight in flights:
         for s in range(seed, seed + plan.seeds):
             maps: Maps = stores.maps.load(maps_name(flight, s))
             for radius in plan.radii_km:
-                for name in METHODS:
+                for name in plan.methods:
                     prediction = stores.predictions.load(prediction_name(name, radius, flight, s, False))
                     scored = score(prediction, maps, len(maps.snapshots), radius)
-                    found.append(Trial(name, radius, flight.number, s, scored, dict(prediction.seconds)))
+                    found.append(Trial(name, radius, flight.name, s, scored, prediction))
     return found
+
+
+def methods_of(scored: Sequence[Trial]) -> list[str]:
+    """Those that were run, in the order of the tables."""
+    run = {trial.method for trial in scored}
+    return [name for name in METHODS if name in run]
 
 
 def recall_table(scored: Sequence[Trial], radii_km: Sequence[int]) -> list[dict[str, Any]]:
@@ -136,9 +157,7 @@ def error_table(
         row: dict[str, Any] = {"flight": flight.number}
         for radius in (r for r in radii_km if r in LARGE_RADII_KM):
             mine = [
-                t.score
-                for t in scored
-                if (t.method, t.radius_km, t.flight) == (method, radius, flight.number)
+                t.score for t in scored if (t.method, t.radius_km, t.flight) == (method, radius, flight.name)
             ]
             right = sum(s.rank == 1 for s in mine)
             column = LARGE_RADII_KM.index(radius)
@@ -157,14 +176,14 @@ class Converged:
     method: str
     radius_km: int
     seed: int
-    flight: int
+    flight: str
     first: int | None
     stable: int | None
     ranks: tuple[int, ...]
     stable_rank: int | None
 
 
-def converged(stores: Stores, flights: Sequence[PaperFlight], plan: Plan, seed: int) -> list[Converged]:
+def converged(stores: Stores, flights: Sequence[Flight], plan: Plan, seed: int) -> list[Converged]:
     """Every prefix of every flight that the plan asks for, scored."""
     found = []
     for flight in flights:
@@ -177,35 +196,40 @@ def converged(stores: Stores, flights: Sequence[PaperFlight], plan: Plan, seed: 
                     first, stable = first_and_stable([one.rank == 1 for one in scores])
                     ranks = tuple(one.bin_rank for one in scores)
                     _, top = first_and_stable([rank == 1 for rank in ranks])
-                    found.append(Converged(name, radius, s, flight.number, first, stable, ranks, top))
+                    found.append(Converged(name, radius, s, flight.name, first, stable, ranks, top))
     return found
 
 
 def convergence_table(all_of: Sequence[Converged]) -> list[dict[str, Any]]:
-    """Mean keyframes to the first and the stable success, over the flights that have one, and the paper's."""
+    """Mean keyframes to the first and the stable success, over the flights of all seeds that have one; its
+    95 % interval, from the scatter of the seeds' means; the paper's; by flight the mean and the ends."""
     rows = []
     for name, radius in dict.fromkeys((c.method, c.radius_km) for c in all_of):
         mine = [c for c in all_of if (c.method, c.radius_km) == (name, radius)]
-        first, stable = ([getattr(c, kind) for c in mine] for kind in ("first", "stable"))
         column = LARGE_RADII_KM.index(radius) if radius in LARGE_RADII_KM else None
         row: dict[str, Any] = {"method": name, "radius_km": radius, "flights": len(mine)}
-        for kind, values, published in (
-            ("first success", first, FIRST_SUCCESS), ("stable success", stable, STABLE_SUCCESS)
-        ):  # fmt: skip
-            reached = [v for v in values if v is not None]
-            row[kind] = float(np.mean(reached)) if reached else None
-            row[f"{kind}, flights"] = len(reached)
-            row[f"{kind}, paper's"] = None if column is None else published[column]
-        row["by flight, first"] = ", ".join(f"{c.flight}: {c.first}" for c in mine)
-        row["by flight, stable"] = ", ".join(f"{c.flight}: {c.stable}" for c in mine)
-        rows.append(row)
+        by_flight: dict[str, str] = {}
+        for kind, published in (("first", FIRST_SUCCESS), ("stable", STABLE_SUCCESS)):
+            reached = [(c, getattr(c, kind)) for c in mine if getattr(c, kind) is not None]
+            row[f"{kind} success"] = float(np.mean([n for _, n in reached])) if reached else None
+            seeds = [[n for c, n in reached if c.seed == seed] for seed in {c.seed for c, _ in reached}]
+            row[f"{kind} success_95%"] = mean_interval([float(np.mean(some)) for some in seeds])
+            row[f"{kind} success, flights"] = len(reached)
+            row[f"{kind} success, paper's"] = None if column is None else published[column]
+            parts = []
+            for flight in dict.fromkeys(c.flight for c in mine):
+                some = [n for c, n in reached if c.flight == flight]
+                told = f"{np.mean(some):.1f} ({min(some)} to {max(some)})" if some else "never"
+                parts.append(f"{flight}: {told}")
+            by_flight[f"by flight, {kind}"] = ", ".join(parts)
+        rows.append(row | by_flight)
     return rows
 
 
 def acceptance_table(scored: Sequence[Trial], radii_km: Sequence[int]) -> list[dict[str, Any]]:
     """Shares of trials whose refined place is right, and which are a fix; and the fixes that are wrong."""
     rows = []
-    for name in (n for n in METHODS if n != BRM):
+    for name in (n for n in methods_of(scored) if n != BRM):
         for radius in radii_km:
             found = recall_row([t.score for t in scored if (t.method, t.radius_km) == (name, radius)])
             kept = {key: found[key] for key in ("trials", "final within 100 m", "fixes", "false fixes")}
@@ -216,9 +240,10 @@ def acceptance_table(scored: Sequence[Trial], radii_km: Sequence[int]) -> list[d
 def runtime_table(scored: Sequence[Trial], radii_km: Sequence[int]) -> list[dict[str, Any]]:
     """Median milliseconds per stage of a query with a whole flight's map."""
     rows = []
-    for name in METHODS:
+    for name in methods_of(scored):
         for radius in radii_km:
-            mine = [t.seconds for t in scored if (t.method, t.radius_km) == (name, radius) and t.seconds]
+            asked = [t.prediction for t in scored if (t.method, t.radius_km) == (name, radius)]
+            mine = [prediction.seconds for prediction in asked if prediction.seconds]
             stages = dict.fromkeys(stage for seconds in mine for stage in seconds)
             row: dict[str, Any] = {"method": name, "radius_km": radius}
             row["total_ms"] = 1e3 * float(np.median([sum(s.values()) for s in mine])) if mine else None
@@ -231,21 +256,41 @@ def runtime_table(scored: Sequence[Trial], radii_km: Sequence[int]) -> list[dict
 
 
 def failure_table(scored: Sequence[Trial]) -> list[dict[str, Any]]:
-    """What lost the trials whose first place is wrong, and which they were."""
+    """What lost the trials whose first place is wrong, which they were, and the median of their funnel."""
     rows = []
-    for name in METHODS:
+    for name in methods_of(scored):
         lost = [t for t in scored if t.method == name and t.score.lost_by]
         for reason, count in Counter(t.score.lost_by for t in lost).most_common():
             mine = [t for t in lost if t.score.lost_by == reason]
-            where = Counter(f"flight {t.flight} at {t.radius_km} km" for t in mine)
+            where = Counter(f"{t.flight} at {t.radius_km} km" for t in mine)
             places = ", ".join(f"{place}: {n}" for place, n in where.most_common())
-            rows.append({"method": name, "lost by": reason, "trials": count, "where": places})
+            row = {"method": name, "lost by": reason, "trials": count, "where": places}
+            rows.append(row | {stage: _median_of(mine, stage) for stage in FUNNEL})
     return rows
 
 
-def bars(
-    scored: Sequence[Trial], traces: Sequence[Converged], seconds: float, quick: bool
-) -> list[dict[str, Any]]:
+def _median_of(trials: Sequence[Trial], stage: str) -> float | None:
+    counts = [t.prediction.funnel[stage] for t in trials if stage in t.prediction.funnel]
+    return float(np.median(counts)) if counts else None
+
+
+def failures_one_by_one(scored: Sequence[Trial], method: str) -> list[dict[str, Any]]:
+    """Every trial of a method whose first place is wrong: where it went, why it was or was not refused as a
+    fix, and its funnel."""
+    return [
+        {
+            "flight": t.flight, "radius_km": t.radius_km, "seed": t.seed, "lost by": t.score.lost_by,
+            "rank": t.score.rank or None, "rank of the true bin": t.score.bin_rank,
+            "first place off, m": t.score.coarse_m if math.isfinite(t.score.coarse_m) else None,
+            "refused": t.prediction.refused,
+            **{stage: t.prediction.funnel.get(stage) for stage in FUNNEL},
+        }
+        for t in scored
+        if t.method == method and t.score.lost_by
+    ]  # fmt: skip
+
+
+def bars(scored: Sequence[Trial], traces: Sequence[Converged]) -> list[dict[str, Any]]:
     """The issue's bars that this run can answer."""
 
     def recall(method: str, radii: Sequence[int]) -> float | None:
@@ -256,28 +301,32 @@ def bars(
     finals = [s.final_m for s in large if s.rank == 1 and math.isfinite(s.final_m)]
     stable = [c.stable for c in traces if c.method == OURS and c.radius_km == 6]
     reached = [s for s in stable if s is not None]
-    mean = float(np.mean(reached)) if reached and len(reached) == len(stable) else None
+    mean = float(np.mean(reached)) if reached else None
     # What, bar, measured, whether more is better, whether this run can tell.
     rows = [
         ("default preset, recall@1 at 6 and 9 km", 1.0, recall(OURS, (6, 9)), True, None),
         ("default preset, recall@1 at 12 km", 0.97, recall(OURS, (12,)), True, None),
         ("paper preset, recall@1 at 12 km (paper: 5/7)", None, recall("paper preset", (12,)), True, None),
-        ("keyframes to stable success at 6 km, mean over all flights", 30.0, mean, False, bool(stable)),
+        (
+            f"keyframes to stable success at 6 km, mean of the {len(reached)} of {len(stable)} that reach it",
+            30.0,
+            mean,
+            False,
+            bool(stable),
+        ),
         ("final error, median, m", 10.0, float(np.median(finals)) if finals else None, False, bool(large)),
         ("final error, worst, m", 30.0, max(finals) if finals else None, False, bool(large)),
-        (
-            "minutes of this run, of what was not there yet",
-            5.0 if quick else 60.0,
-            seconds / 60.0,
-            False,
-            True,
-        ),
     ]
     return [
-        {"what": what, "bar": bar, "measured": value, "held": held(bar, value, more)}
+        judged(what, bar, value, more)
         for what, bar, value, more, told in rows
         if told or (told is None and value is not None)
     ]
+
+
+def judged(what: str, bar: float | None, value: float | None, more: bool) -> dict[str, Any]:
+    """A row of the table of bars."""
+    return {"what": what, "bar": bar, "measured": value, "held": held(bar, value, more)}
 
 
 def held(bar: float | None, value: float | None, more: bool) -> bool | None:
@@ -287,11 +336,10 @@ def held(bar: float | None, value: float | None, more: bool) -> bool | None:
     return value is not None and (value >= bar if more else value <= bar)
 
 
-def write(
-    out: Path, stores: Stores, flights: Sequence[PaperFlight], plan: Plan, models: Models, seed: int,
-    quick: bool, seconds: float,
-) -> str:  # fmt: skip
-    """Score all predictions, write report.json and report.html; the summary."""
+def boston(
+    out: Path, stores: Stores, flights: Sequence[PaperFlight], plan: Plan, models: Models, seed: int
+) -> Chapter:
+    """Score all predictions of the paper's flights; draws into ``out``."""
     kept, buildings = stores.ground.load("reference")
     reference = outlines_of(kept)
     scored, traces = trials(stores, flights, plan, seed), converged(stores, flights, plan, seed)
@@ -305,15 +353,9 @@ def write(
         }
         for f in flights
     }
-    report = {
-        "evaluation": "paper",
+    said = {
         "what is real": REAL,
         "not done": NOT_DONE,
-        "command": " ".join(["buildloc", *sys.argv[1:]]),
-        "seed": seed,
-        "quick": quick,
-        **machine(),
-        "bars": bars(scored, traces, seconds, quick),
         "flights and references": flight_table(flights, maps, counts),
         "recall": recall_table(scored, plan.radii_km),
         "errors, default preset": error_table(scored, OURS, flights, plan.radii_km),
@@ -322,13 +364,33 @@ def write(
         "convergence": convergence_table(traces),
         "time of a query": runtime_table(scored, plan.radii_km),
         "failures": failure_table(scored),
+        f"failures of the {OURS}, one by one": failures_one_by_one(scored, OURS),
         "error models": asdict(models),
         "plan": asdict(plan),
     }
-    (out / "report.json").write_text(json.dumps(report, indent=2) + "\n")
     pictures = draw(out, stores, flights, plan, seed, reference, scored, traces)
-    write_report(out / "report.html", "The paper's experiments on open data", report, pictures)
-    return summary(report)
+    return Chapter("Seven flights over Boston", said, bars(scored, traces), pictures)
+
+
+def write(out: Path, chapters: Sequence[Chapter], seed: int, quick: bool, seconds: float) -> str:
+    """Write report.json and report.html; the summary."""
+    minutes = judged(
+        "minutes of this run, of what was not there yet", 5.0 if quick else 60.0, seconds / 60.0, False
+    )
+    report = {
+        "evaluation": "paper",
+        "what is real": {chapter.title: chapter.said["what is real"] for chapter in chapters},
+        "command": " ".join(["buildloc", *sys.argv[1:]]),
+        "seed": seed,
+        "quick": quick,
+        **machine(),
+        "bars": [*(row for chapter in chapters for row in chapter.bars), minutes],
+    }
+    whole = report | {chapter.title: chapter.said for chapter in chapters}
+    (out / "report.json").write_text(json.dumps(whole, indent=2) + "\n")
+    told = [(chapter.title, chapter.said, chapter.pictures) for chapter in chapters]
+    write_report(out / "report.html", "The paper's experiments on open data", report, [], told)
+    return summary(report, chapters)
 
 
 def draw(
@@ -337,24 +399,16 @@ def draw(
 ) -> list[tuple[str, Path]]:  # fmt: skip
     """All figures with their captions."""
     centres = shapely.get_coordinates(shapely.centroid(reference))
-    around = {f.number: reference[np.hypot(*(centres - f.centre_m).T) < 1500.0] for f in flights}
-    first = {f.number: stores.maps.load(maps_name(f, seed)) for f in flights}
-    paths = {number: maps.true_m for number, maps in first.items()}
+    around = {f.name: reference[np.hypot(*(centres - f.centre_m).T) < 1500.0] for f in flights}
+    first = {f.name: stores.maps.load(maps_name(f, seed)) for f in flights}
+    paths = {name: maps.true_m for name, maps in first.items()}
     pictures = [
         (
             "Flights over the reference (simulated flights, real footprints)",
             figures.draw_trajectories(out / "trajectories.png", around, paths),
         )
     ]
-    for name, radius in dict.fromkeys((c.method, c.radius_km) for c in traces):
-        mine = [
-            figures.Trace(c.flight, c.ranks, c.stable_rank)
-            for c in traces
-            if (c.method, c.radius_km, c.seed) == (name, radius, seed)
-        ]
-        path = out / f"convergence_{name.replace(' ', '_')}_{radius}km.png"
-        figures.draw_convergence(path, mine, radius, bins_within(radius))
-        pictures.append((f"Rank of the true bin as keyframes accumulate: {name}, {radius} km", path))
+    pictures += convergence_pictures(out, traces)
     rows = {name: radius_row(scored, name, plan.radii_km) for name in METHODS}
     drawn = figures.draw_radius(out / "radius.png", plan.radii_km, rows)
     pictures.append(("Recall, coarse error and time against the search radius", drawn))
@@ -363,13 +417,32 @@ def draw(
     found: dict[str, Prediction] = {
         name: stores.predictions.load(prediction_name(name, radius, shown, seed, False)) for name in METHODS
     }
-    maps, wide = first[shown.number], 1000.0 * radius + figures.VIEW_M
+    maps, wide = first[shown.name], 1000.0 * radius + figures.VIEW_M
     last = maps.snapshots[-1]
     map_m = np.empty((0, 2)) if last is None else last.local_map.centroids_m
     within = reference[np.hypot(*(centres - shown.centre_m).T) < wide]
     truths = {name: _truth(maps, prediction) for name, prediction in found.items()}
     path = figures.draw_candidates(out / "candidates.png", within, found, map_m, truths, CORRECT_M)
-    pictures.append((f"The first three places of every method: flight {shown.number}, {radius} km", path))
+    pictures.append((f"The first three places of every method: {shown.name}, {radius} km", path))
+    return pictures
+
+
+def convergence_pictures(out: Path, traces: Sequence[Converged]) -> list[tuple[str, Path]]:
+    """The rank of the true bin over the keyframes of all seeds, for each method and radius."""
+    pictures = []
+    for name, radius in dict.fromkeys((c.method, c.radius_km) for c in traces):
+        mine = [c for c in traces if (c.method, c.radius_km) == (name, radius)]
+        drawn = []
+        for flight in dict.fromkeys(c.flight for c in mine):
+            of = [c for c in mine if c.flight == flight]
+            stable = [c.stable_rank for c in of if c.stable_rank is not None]
+            median = float(np.median(stable)) if len(stable) == len(of) else None
+            shortest = min(len(c.ranks) for c in of)
+            ranks = np.array([c.ranks[:shortest] for c in of])
+            drawn.append(figures.Trace(flight, ranks, median))
+        path = out / f"convergence_{name.replace(' ', '_')}_{radius}km.png"
+        figures.draw_convergence(path, drawn, radius, bins_within(radius))
+        pictures.append((f"Rank of the true bin as keyframes accumulate: {name}, {radius} km", path))
     return pictures
 
 
@@ -387,34 +460,38 @@ def radius_row(
     row: dict[str, list[float | None]] = {"recall@1": [], "coarse error, m": [], "seconds per query": []}
     for radius in radii_km:
         mine = [t for t in scored if (t.method, t.radius_km) == (method, radius)]
-        times = [sum(t.seconds.values()) for t in mine if t.seconds]
+        times = [sum(t.prediction.seconds.values()) for t in mine if t.prediction.seconds]
         row["recall@1"].append(sum(t.score.rank == 1 for t in mine) / len(mine))
         row["coarse error, m"].append(error_row([t.score for t in mine])["coarse_median_m"])
         row["seconds per query"].append(float(np.median(times)) if times else None)
     return row
 
 
-def summary(report: dict[str, Any]) -> str:
+def summary(report: dict[str, Any], chapters: Sequence[Chapter]) -> str:
     """For people."""
-    lines = [*report["what is real"], *report["not done"], ""]
-    lines += [
-        f"{row['what']}: {_figure(row['measured'])}"
-        + (
-            ""
-            if row["bar"] is None
-            else f" (bar {_figure(row['bar'])}: {'held' if row['held'] else 'missed'})"
-        )
-        for row in report["bars"]
-    ]
-    lines += ["", "recall@1, ours (the paper's)"]
-    for row in report["recall"]:
-        if row["metric"] == "R@1":
-            cells = [
-                f"{radius} km {row.get(f'{radius} km', '-').split(' ')[0]} ({row[f'paper, {radius} km']})"
-                for radius in report["plan"]["radii_km"]
-            ]
-            lines.append(f"{row['method']:<18} " + "  ".join(cells))
+    lines = []
+    for chapter in chapters:
+        lines += [chapter.title, *(f"  {text}" for text in chapter.said["what is real"])]
+        lines += [f"  {text}" for text in chapter.said["not done"]]
+        if "recall" in chapter.said:
+            lines += ["  recall@1, ours (the paper's)", *recall_lines(chapter.said)]
+    for row in report["bars"]:
+        bar = f" (bar {_figure(row['bar'])}: {'held' if row['held'] else 'missed'})"
+        lines.append(f"{row['what']}: {_figure(row['measured'])}" + ("" if row["bar"] is None else bar))
     return "\n".join(lines)
+
+
+def recall_lines(said: dict[str, Any]) -> list[str]:
+    """First places right, by method and radius."""
+    return [
+        f"  {row['method']:<18} "
+        + "  ".join(
+            f"{radius} km {row.get(f'{radius} km', '-').split(' ')[0]} ({row[f'paper, {radius} km']})"
+            for radius in said["plan"]["radii_km"]
+        )
+        for row in said["recall"]
+        if row["metric"] == "R@1"
+    ]
 
 
 def _figure(value: float | None) -> str:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from buildloc_msgs_py.types import FloatArray
 from scipy.stats import binomtest
+from scipy.stats import t as student
 
 from buildloc_eval.paper.flown import Maps, true_place
 from buildloc_eval.paper.methods import Prediction
@@ -40,14 +41,19 @@ def score(found: Prediction, maps: Maps, keyframes: int, radius_km: float) -> Sc
     snapshot, truth = maps.snapshots[keyframes - 1], last
     if found.centre_m is not None and snapshot is not None:
         truth = true_place(maps, snapshot, found.centre_m)
-    errors = np.hypot(*(found.places_m - truth).T)
+    final = math.inf if found.final_m is None else float(np.hypot(*(found.final_m - last)))
+    return replace(placed(found, truth, radius_km), final_m=final)
+
+
+def placed(found: Prediction, truth_m: FloatArray, radius_km: float) -> Score:
+    """Compare the places of a prediction with the true one (2,); nothing of a refined place."""
+    errors = np.hypot(*(found.places_m - truth_m).T)
     right = np.flatnonzero(errors <= CORRECT_M)
     rank = int(right[0]) + 1 if len(right) else 0
-    final = math.inf if found.final_m is None else float(np.hypot(*(found.final_m - last)))
-    bin_rank = rank_of_bin(found, truth, radius_km)
+    bin_rank = rank_of_bin(found, truth_m, radius_km)
     lost = "" if rank == 1 else lost_by(found, rank, bin_rank, radius_km)
     coarse = float(errors[0]) if len(errors) else math.inf
-    return Score(rank, coarse, final, bin_rank, found.refused is None, lost)
+    return Score(rank, coarse, math.inf, bin_rank, found.refused is None, lost)
 
 
 def bins_within(radius_km: float) -> int:
@@ -65,7 +71,8 @@ def rank_of_bin(found: Prediction, truth_m: FloatArray, radius_km: float) -> int
 def lost_by(found: Prediction, rank: int, bin_rank: int, radius_km: float) -> str:
     """The stage that lost a prediction whose first place is wrong."""
     if not len(found.places_m):
-        return found.refused or "no candidate"
+        no_map = found.refused or "no place"
+        return no_map if found.centre_m is None else "voting: no place gathers enough consistent votes"
     if rank > 1:
         return "ranking: a wrong candidate scored higher"
     if not len(found.bins):
@@ -87,6 +94,17 @@ def interval(successes: int, trials: int) -> tuple[float, float]:
     """95 % interval of a share, Wilson's."""
     found = binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
     return round(float(found.low), 4), round(float(found.high), 4)
+
+
+def mean_interval(values: Sequence[float]) -> list[float] | None:
+    """95 % interval of a mean, Student's; None for fewer than two values."""
+    if len(values) < 2:
+        return None
+    half = float(
+        student.ppf(0.5 + 0.5 * CONFIDENCE, len(values) - 1) * np.std(values, ddof=1) / math.sqrt(len(values))
+    )
+    mean = float(np.mean(values))
+    return [round(mean - half, 2), round(mean + half, 2)]
 
 
 def recall_row(scores: Sequence[Score]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The real footprints of greater Boston, in metres."""
+"""Real footprints, in metres."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from pathlib import Path
 import geopandas as gpd
 import numpy as np
 import shapely
+from buildloc_matcher.reference.buildings import Buildings
+from buildloc_msgs_py.footprint import footprints
 from pyproj import Transformer
 
 from buildloc_eval.paper.flights import EPSG, MIN_AREA_M2
@@ -17,9 +19,26 @@ FOOTPRINTS = "footprints/boston_osm.parquet"
 
 
 def read_boston(path: Path | None = None) -> Outlines:
-    """(N,) valid polygons of at least 20 m2, metres of EPSG. Raises DataError without the data."""
-    degrees = gpd.read_parquet(path or data_folder() / FOOTPRINTS, columns=["geometry"]).geometry.to_numpy()
-    to_utm = Transformer.from_crs(4326, EPSG, always_xy=True)
-    metres = shapely.transform(degrees, lambda xy: np.column_stack(to_utm.transform(xy[:, 0], xy[:, 1])))
-    usable = shapely.is_valid(metres) & (shapely.get_type_id(metres) == shapely.GeometryType.POLYGON)
-    return np.asarray(metres[usable & (shapely.area(metres) >= MIN_AREA_M2)])
+    """Greater Boston, metres of EPSG, as :func:`read_outlines`."""
+    return read_outlines(path or data_folder() / FOOTPRINTS, EPSG)
+
+
+def read_outlines(path: Path, epsg: int) -> Outlines:
+    """(N,) polygons fit for use, metres of a UTM zone. Raises DataError without the data."""
+    degrees = gpd.read_parquet(path, columns=["geometry"]).geometry.to_numpy()
+    to_utm = Transformer.from_crs(4326, epsg, always_xy=True)
+    return usable(
+        shapely.transform(degrees, lambda xy: np.column_stack(to_utm.transform(xy[:, 0], xy[:, 1])))
+    )
+
+
+def usable(outlines: Outlines) -> Outlines:
+    """The valid polygons of at least 20 m2 (outlines in metres)."""
+    valid = shapely.is_valid(outlines) & (shapely.get_type_id(outlines) == shapely.GeometryType.POLYGON)
+    return np.asarray(outlines[valid & (shapely.area(outlines) >= MIN_AREA_M2)])
+
+
+def measure(outlines: Outlines) -> Buildings:
+    """The outlines as a reference has them."""
+    found = footprints(outlines)
+    return Buildings(found.centroids_m, found.areas_m2.astype(np.float32), found.shapes.astype(np.float32))

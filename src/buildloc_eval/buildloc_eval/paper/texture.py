@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from buildloc_eval.orthos import banepa, barnarp
-from buildloc_eval.paper.flights import EPSG, PaperFlight
+from buildloc_eval.paper.flights import EPSG, PlacedFlight
 from buildloc_eval.world import MirroredWorld, PictureWorld
 
 GROUNDS = (barnarp, banepa)
@@ -18,7 +18,7 @@ SHIFT_M = (150.0, 30.0)
 TIMES = 2
 
 
-def ground_texture(data: Path, flight: PaperFlight, rng: np.random.Generator) -> MirroredWorld:
+def ground_texture(data: Path, flight: PlacedFlight, rng: np.random.Generator) -> MirroredWorld:
     """Barnarp or Banepa, in turns, laid so that the seam from north to south passes near the flight's centre.
 
     The other seam stays out of sight: where the two cross, the ground is a copy of itself turned by half a

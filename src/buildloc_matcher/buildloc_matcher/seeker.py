@@ -1,0 +1,160 @@
+"""From maps and tracked frames to fixes: acquires by the global search, follows, and lets go. No ROS.
+
+The state is a :class:`pursuit.Pursuit`, replaced whole under a lock: maps are solved on one thread while
+frames and keyframes come on another.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+from buildloc_msgs_py.types import Fix, FrameObservation, Keyframe, LocalMap, NoFix, Tracked
+
+from buildloc_matcher.acceptance import Outcome
+from buildloc_matcher.geometry import wrap
+from buildloc_matcher.matcher import Answer, Matcher
+from buildloc_matcher.pursuit import (
+    Anchor,
+    Mode,
+    Place,
+    Pursuit,
+    agree,
+    carry,
+    coast,
+    locate,
+    prediction,
+    sigmas_apart,
+    withdraw,
+)
+
+WAITING = "waiting for a map"
+UNTRACKED = "no frame is tracked in a keyframe that has a place"
+Step = Callable[[Pursuit], Pursuit]
+
+
+class Seeker:
+    """One flight in one reference database. ``reason`` says why there is no fix when there is none;
+    ``withdrawals`` counts how often a place was given up."""
+
+    def __init__(self, matcher: Matcher) -> None:
+        self.matcher = matcher
+        self.withdrawals = 0
+        self._lock = threading.Lock()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the flight."""
+        with self._lock:
+            self.pursuit = Pursuit()
+            self._flight = object()
+            self._fixed_ns = -1
+            self._unchecked = 0  # maps since the last global search
+            self.reason = WAITING
+
+    def carry(self, keyframes: Sequence[Keyframe]) -> None:
+        """Take the mapper's latest keyframes."""
+        with self._lock:
+            self._become(carry(self.pursuit, keyframes, self.matcher.config))
+
+    def locate(self, tracked: Tracked) -> Fix | NoFix:
+        """The fix of a tracked frame, or why there is none."""
+        with self._lock:
+            place = locate(self.pursuit, tracked, self.matcher.config)
+            if isinstance(place, Place):
+                return self.matcher.fix_at(place, tracked.height_m)
+            if self.pursuit.mode is Mode.ACQUIRE:
+                return NoFix(tracked.stamp_ns, self.reason)
+            if tracked.keyframe_ns in self.pursuit.anchors:
+                self._become(withdraw(self.pursuit, place))
+            return NoFix(tracked.stamp_ns, place)
+
+    def fresh(self, fix: Fix) -> bool:
+        """Whether a fix is later than all that were given out; it counts as given out then."""
+        with self._lock:
+            later = fix.stamp_ns > self._fixed_ns
+            self._fixed_ns = max(self._fixed_ns, fix.stamp_ns)
+            return later
+
+    def solve(
+        self, local_map: LocalMap, keyframes: Sequence[Keyframe], observations: Sequence[FrameObservation]
+    ) -> Answer:
+        """The position of the camera at a map's last keyframe, or why there is none: by the global search
+        until there is a place to go on from, from then on by asking the reference about that place."""
+        with self._lock:
+            pursuit, flight = self.pursuit, self._flight
+        last = max(keyframes, key=lambda k: k.stamp_ns, default=None)
+        anchor = None if last is None else pursuit.anchors.get(last.stamp_ns)
+        if last is None or anchor is None:
+            answer, step = self._acquire(local_map, keyframes, observations)
+        else:
+            answer, step = self._follow(anchor, last, local_map, keyframes, observations)
+        with self._lock:
+            if flight is not self._flight:
+                return Answer(NoFix(local_map.stamp_ns, "the flight was forgotten meanwhile"), (), {})
+            self.reason = answer.result.reason if isinstance(answer.result, NoFix) else UNTRACKED
+            self._become(step(self.pursuit))
+        return answer
+
+    def _acquire(
+        self, local_map: LocalMap, keyframes: Sequence[Keyframe], observations: Sequence[FrameObservation]
+    ) -> tuple[Answer, Step]:
+        self._unchecked = 0
+        answer = self.matcher.fix(local_map, keyframes, observations)
+        if answer.agreement is None:
+            return answer, lambda pursuit: pursuit
+        return answer, partial(agree, agreement=answer.agreement, config=self.matcher.config)
+
+    def _follow(
+        self,
+        anchor: Anchor,
+        last: Keyframe,
+        local_map: LocalMap,
+        keyframes: Sequence[Keyframe],
+        observations: Sequence[FrameObservation],
+    ) -> tuple[Answer, Step]:
+        matcher, config = self.matcher, self.matcher.config
+        self._unchecked += 1
+        if self._unchecked >= config.check_keyframes:
+            self._unchecked = 0
+            found = matcher.fix(local_map, keyframes, observations)
+            if (elsewhere := self._elsewhere(found, anchor)) is not None:
+                none = NoFix(last.stamp_ns, elsewhere)
+                return Answer(none, found.candidates, found.funnel), partial(withdraw, reason=elsewhere)
+        uncertainty = anchor.uncertainty(config)
+        followed = matcher.follow(prediction(anchor, last), uncertainty, keyframes, observations)
+        opinion, agreement = followed.opinion, followed.agreement
+        funnel = {"follow_nats": opinion.nats, "follow_lead": opinion.lead}
+        if opinion.outcome is Outcome.REJECTED:
+            none = NoFix(last.stamp_ns, opinion.reason)
+            return Answer(none, (), funnel), partial(withdraw, reason=opinion.reason)
+        place, step = Place(last.stamp_ns, anchor.x_m, anchor.y_m, anchor.yaw_rad, uncertainty), coast
+        if agreement is not None:
+            place = Place(last.stamp_ns, *agreement.poses[last.stamp_ns], agreement.covariance)
+            step = partial(agree, agreement=agreement, config=config)
+        altitude = next((o.altitude_m for o in observations if o.stamp_ns == last.stamp_ns), math.nan)
+        return Answer(matcher.fix_at(place, altitude), (), funnel, agreement), step
+
+    def _elsewhere(self, found: Answer, anchor: Anchor) -> str | None:
+        """What a global search found, if that is another place than the anchor's."""
+        if found.agreement is None:
+            return None
+        fix, config = found.result, self.matcher.config
+        assert isinstance(fix, Fix)
+        offset = np.array([fix.easting_m - anchor.x_m, fix.northing_m - anchor.y_m, 0.0])
+        offset[2] = wrap(fix.yaw_rad - anchor.yaw_rad)
+        apart = sigmas_apart(offset, anchor.uncertainty(config) + found.agreement.covariance)
+        if apart <= config.max_jump_sigmas:
+            return None
+        away = math.hypot(*offset[:2])
+        return f"the global search found another place, {away:.1f} m away, {apart:.1f} standard deviations"
+
+    def _become(self, pursuit: Pursuit) -> None:
+        """Change the state; the lock is held."""
+        if self.pursuit.mode is not Mode.ACQUIRE and pursuit.mode is Mode.ACQUIRE:
+            self.withdrawals += 1
+            self.reason = pursuit.withdrawn
+        self.pursuit = pursuit
