@@ -81,8 +81,8 @@ def _ground(one: Trial, grounds: Grounds) -> tuple[Flown, Place]:
 
 
 def config_of(one: Trial) -> MatcherConfig:
-    """The default preset."""
-    return matcher_config()
+    """The default preset, which knows how well the reference is registered."""
+    return matcher_config({"sigma_registration_m": math.hypot(one.shift_m, one.place.registration_m)})
 
 
 def run(number: int, grounds: Grounds) -> Record:
