@@ -150,7 +150,7 @@ def test_ground_that_is_absent_is_absent(grounds: Grounds) -> None:
         one = trial(TINY, 1, number)
         tried = attempt(one, grounds)
         assert one.absent and one.control
-        distance, _ = cKDTree(tried.database.centroids_m).query(tried.truth_m)
+        distance, _ = cKDTree(tried.database.centroids_m).query(tried.camera_m)
         if kind != "mirrored":
             assert distance > 900.0
     assert trial(TINY, 1, first("grid suburbs", "absent")).absent
