@@ -235,8 +235,8 @@ def run_eval(args: argparse.Namespace) -> int:
     elif args.name == "integrity":
         from buildloc_eval.integrity import evaluate as integrity
 
-        trials = args.trials or (integrity.QUICK_TRIALS if args.quick else integrity.TRIALS)
-        print(integrity.evaluate(args.out, args.plan or "test", trials, args.seed, _stage))
+        plan = args.plan or "test"
+        print(integrity.evaluate(args.out, plan, args.trials, args.seed, args.quick, _stage))
     elif args.name == "mapping":
         from buildloc_eval import mapping
 

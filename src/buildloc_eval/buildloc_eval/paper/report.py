@@ -58,6 +58,7 @@ REAL = [
     "another and by the errors of automatic mapping that are listed below",
     "the paper's own figures are of seven real flights over Denver with Microsoft's footprints",
 ]
+TIMES = "wall-clock, with as many flights located at once as there are cores; BRM alone"
 NOT_DONE = ["NetVLAD has not been run: the paper's figures stand alone in its rows"]
 
 
@@ -356,6 +357,7 @@ def boston(
     said = {
         "what is real": REAL,
         "not done": NOT_DONE,
+        "seeds": list(range(seed, seed + plan.seeds)),
         "flights and references": flight_table(flights, maps, counts),
         "recall": recall_table(scored, plan.radii_km),
         "errors, default preset": error_table(scored, OURS, flights, plan.radii_km),
@@ -363,6 +365,7 @@ def boston(
         "refined places and fixes": acceptance_table(scored, plan.radii_km),
         "convergence": convergence_table(traces),
         "time of a query": runtime_table(scored, plan.radii_km),
+        "times": TIMES,
         "failures": failure_table(scored),
         f"failures of the {OURS}, one by one": failures_one_by_one(scored, OURS),
         "error models": asdict(models),
