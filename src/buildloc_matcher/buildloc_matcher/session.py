@@ -74,7 +74,7 @@ class Session:
 
     def add_mask(self, mask: Mask) -> Job | None:
         """What a keyframe saw; a mask without its telemetry counts as seen, with nothing in it."""
-        self.latest_stamp_ns = mask.stamp_ns
+        self.latest_stamp_ns = max(self.latest_stamp_ns, mask.stamp_ns)
         seen: FrameObservation | None = None
         self.telemetry_fault = ""
         try:
@@ -125,6 +125,7 @@ class Session:
 
     def locate(self, tracked: Tracked) -> Fix | NoFix:
         """The fix of a tracked frame, or why there is none."""
+        self.latest_stamp_ns = max(self.latest_stamp_ns, tracked.stamp_ns)
         if self.seeker is None:
             return NoFix(tracked.stamp_ns, self.reason)
         return self.seeker.locate(tracked)
