@@ -40,16 +40,16 @@ def _with_bounds(axes: Axes, x: Sequence[float], shares: Rows, label: str) -> No
 
 
 def draw_curves(out: Path, curves: dict[str, Rows]) -> Picture:
-    """Availability against the false-fix rate, its upper bound shaded: a point for every threshold."""
+    """Availability against the false-fix rate and its upper bound (dotted): a point for every threshold."""
     figure, axes = plt.subplots(figsize=(8, 5))
     for label, rows in curves.items():
         rate = np.array([row["false-fix rate"]["share"] for row in rows])
         high = np.array([row["false-fix rate"]["95%"][1] for row in rows])
         available = np.array([row["availability"]["share"] for row in rows])
         (line,) = axes.plot(np.maximum(rate, 1e-6), available, "o-", markersize=3, label=label)
-        axes.fill_betweenx(available, np.maximum(rate, 1e-6), high, alpha=0.15, color=line.get_color())
+        axes.plot(high, available, ":", color=line.get_color())
     axes.set(
-        xscale="log", xlabel="false fixes per trial, to their upper 95 % bound (at the left edge: none)",
+        xscale="log", xlabel="false fixes per trial; dotted: upper 95 % bound; at the left edge: none",
         ylabel="availability: flights with a right fix", ylim=(0, 1),
     )  # fmt: skip
     axes.grid(alpha=0.3)

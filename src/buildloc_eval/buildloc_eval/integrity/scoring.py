@@ -255,10 +255,9 @@ def cost_rows(records: pd.DataFrame) -> list[dict[str, Any]]:
 def bars(records: pd.DataFrame, trials_asked: int) -> list[dict[str, Any]]:
     """The bars of this evaluation: what was reached, with its interval, and whether that meets them."""
     false = int(is_false(records).sum())
-    rows = [_bar(
-        "false fixes, controls included", f"0 in {trials_asked}",
-        {"count": false} | share(false, len(records)), false == 0 and len(records) >= trials_asked,
-    )]  # fmt: skip
+    met = False if false else True if len(records) >= trials_asked else None  # fewer trials prove nothing
+    reached = {"count": false} | share(false, len(records))
+    rows = [_bar("false fixes, controls included", f"0 in {trials_asked}", reached, met)]
     usable = flights(records)
     usable = usable[(usable.buildings >= 60) & (usable.radius_km == 12.0)]
     for level, least in ((1, 0.90), (2, None)):
