@@ -63,7 +63,7 @@ def invented(name: str) -> Source:
 
 
 PLACES = tuple(Place(name, name, name, name, CENTRES_DEG[name], (KM,), KM) for name in ZONES)
-TINY = Plan("test", PLACES, {name: Territory((Circle(*CENTRES_DEG[name], 20.0),)) for name in ZONES})
+TINY = Plan("test", 5, PLACES, {name: Territory((Circle(*CENTRES_DEG[name], 20.0),)) for name in ZONES})
 
 
 @pytest.fixture(scope="module")

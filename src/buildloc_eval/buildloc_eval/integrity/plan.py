@@ -15,8 +15,7 @@ FLIGHT = "flight"  # over ground that the reference holds as it is: four of five
 CONTROLS = (
     "outside", "another city", "mirrored", "missing", "shifted", "grid suburbs", "snow", "scaled",
 )  # fmt: skip
-CONTROL_EVERY = 5
-PAPER_EVERY = 11  # not a multiple of CONTROL_EVERY: every kind has its share
+PAPER_EVERY = 11  # not a multiple of how often controls come: every kind has its share
 CHUNK = 100  # trials with consecutive numbers are of one region
 
 BUILDINGS = (20, 40, 60, 100, 200)
@@ -80,9 +79,11 @@ class Place:
 
 @dataclass(frozen=True)
 class Plan:
-    """A set of places with the territory of every source, ground that no other set touches."""
+    """A set of places with the territory of every source, ground that no other set touches; every
+    ``control_every``-th trial is a negative control."""
 
     name: str
+    control_every: int
     places: tuple[Place, ...]
     territories: dict[str, Territory]
 
@@ -118,6 +119,7 @@ def _tokyo(side: str, half: Box) -> tuple[Place, ...]:
 
 CALIBRATION = Plan(
     "calibration",
+    1,  # what acceptance is calibrated on are wrong candidates
     (_boston("Framingham", FRAMINGHAM), *_tokyo("west", TOKYO_WEST)),
     {
         BOSTON: Territory((ALL_BOSTON,), tuple(Circle(*centre, BOSTON_KM[-1] + GAP_KM) for centre in TESTED)),
@@ -127,6 +129,7 @@ CALIBRATION = Plan(
 )
 TEST = Plan(
     "test",
+    5,
     (
         _boston("Lexington", LEXINGTON),
         _boston("Burlington", BURLINGTON),
@@ -194,8 +197,8 @@ def trial(plan: Plan, seed: int, number: int) -> Trial:
     level = int(rng.choice(LEVELS, p=LEVEL_SHARES))
     shift = float(rng.choice(SHIFTS_M))
     kind, detail, variant, amount, town = FLIGHT, "", AS_IS, 0.0, TOWN_NONE
-    if number % CONTROL_EVERY == CONTROL_EVERY - 1:
-        kind = CONTROLS[number // CONTROL_EVERY % len(CONTROLS)]
+    if number % plan.control_every == plan.control_every - 1:
+        kind = CONTROLS[number // plan.control_every % len(CONTROLS)]
         side = int(rng.integers(2))
         if kind == "outside":
             radius = place.outside_km
