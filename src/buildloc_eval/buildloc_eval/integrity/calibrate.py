@@ -24,8 +24,8 @@ AT_RATE = 1e-5  # where the kinds are compared
 
 
 def fit_tail(scores: FloatArray, other_scale_nats: float = math.nan) -> Tail:
-    """The exponential tail of wrong candidates' scores (N,) above START_NATS, upper bounds of share and scale;
-    with few scores there, the other scale."""
+    """The exponential tail of wrong candidates' scores (N,) above START_NATS: upper bounds of share and
+    scale; with few scores there, the other scale."""
     excess = scores[scores > START_NATS] - START_NATS
     above = len(excess)
     share = float(beta.ppf(BOUND, above + 1, len(scores) - above)) if above < len(scores) else 1.0
