@@ -70,8 +70,8 @@ def check_near_truth(fixes: dict[int, Fix], truth: Truth) -> None:
 
 def test_the_sample_is_localized(offline: Path, truth: Truth) -> None:
     fixes = accepted(offline)
-    # 24 of 31 keyframes when this was written: the first have too few buildings for any fix.
-    assert len(fixes) >= 15
+    # 61 of 100 frames when this was written: the first keyframes have too few buildings for any fix.
+    assert len(fixes) >= 50
     check_near_truth(fixes, truth)
     last = max(fixes)
     assert max(truth.poses) - last <= 5 * 10**9, "the flight ends without a fix"
@@ -86,8 +86,8 @@ def test_two_runs_write_the_same_bytes(offline: Path, database: Path) -> None:
 def test_live_equals_offline(offline: Path, database: Path, truth: Truth) -> None:
     """Position and heading at the stamps of all fixes that /buildloc/fix and /buildloc/pose carried live.
 
-    The same frames must have gone the same way: no image dropped and no keyframe lost. A solve keeps
-    nothing for the next one, so a map that was overtaken costs its own fix and changes no other.
+    The same frames must have gone the same way: no image dropped and no keyframe lost. Live, a frame may be
+    tracked in an older keyframe, and that keyframe placed by an older agreement, or by none yet.
     """
     pytest.importorskip("rclpy", reason="ROS is not installed")
     from drone import domain_id
@@ -103,15 +103,15 @@ def test_live_equals_offline(offline: Path, database: Path, truth: Truth) -> Non
     )  # fmt: skip
     figures = re.search(r"(\d+) dropped, .* (\d+) lost, .* (\d+) overtaken", replay.stdout)
     assert figures is not None, replay.stdout
-    dropped, lost, overtaken = map(int, figures.groups())
+    dropped, lost, _ = map(int, figures.groups())
     assert (dropped, lost) == (0, 0), replay.stdout
     expected, live = accepted(offline), accepted(received)
     assert live.keys() <= expected.keys()
-    assert len(expected) - len(live) <= overtaken <= len(expected) // 2
+    assert len(live) >= len(expected) // 2
+    check_near_truth(live, truth)  # latitude and longitude, too
     for stamp, fix in live.items():
         other = expected[stamp]
-        assert math.hypot(fix.easting_m - other.easting_m, fix.northing_m - other.northing_m) < 0.1
-        assert abs(truth.error_m(fix) - truth.error_m(other)) < 0.1  # latitude and longitude, too
-        assert fix.yaw_rad == pytest.approx(other.yaw_rad, abs=1e-3)
-        assert fix.altitude_m == pytest.approx(other.altitude_m, abs=0.1)
-        np.testing.assert_allclose(fix.covariance_enu_m2, other.covariance_enu_m2, rtol=0.05)
+        apart = math.hypot(fix.easting_m - other.easting_m, fix.northing_m - other.northing_m)
+        assert apart < 3.0 * math.sqrt(np.trace(other.covariance_enu_m2[:2, :2]) / 2.0)
+        assert fix.yaw_rad == pytest.approx(other.yaw_rad, abs=NEAR_RAD)
+        assert fix.altitude_m == pytest.approx(other.altitude_m, abs=1.0)

@@ -423,7 +423,8 @@ def _replay(args: argparse.Namespace) -> int:
         f"{report.frames_unusable} unusable, {report.keyframes} keyframes, {report.keyframes_lost} lost, "
         f"{report.maps} maps, {report.maps_skipped} overtaken; {report.seconds:.1f} s"
     )
-    print(played.timing.line())
+    if played.timing is not None:
+        print(played.timing.line())
     return 0
 
 

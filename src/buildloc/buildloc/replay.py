@@ -70,11 +70,11 @@ class ReplayReport:
 
 @dataclass(frozen=True)
 class Replay:
-    """What came of a replay: the figures, how often and how late fixes came, and the latest map with its
-    keyframes (None, () without one)."""
+    """What came of a replay: the figures, how often and how late fixes came (None without any), and the
+    latest map with its keyframes (None, () without one)."""
 
     report: ReplayReport
-    timing: Timing
+    timing: Timing | None
     local_map: LocalMap | None
     keyframes: tuple[Keyframe, ...]
 

@@ -14,7 +14,7 @@ import numpy as np
 class Timing:
     """Fixes per second of flight from the first on; the longest stretch without one from there to the last
     image, s of flight; seconds by the clock on the wall from an image's publication to the arrival of its
-    fix, median and 95th percentile. NaN where there was no fix."""
+    fix, median and 95th percentile."""
 
     fixes_per_second: float
     longest_gap_s: float
@@ -29,16 +29,15 @@ class Timing:
         )
 
 
-def timing(received: Path, published_ns: Mapping[int, int]) -> Timing:
-    """Of the JSON lines that the fix listener wrote, and when the image of each stamp was published."""
+def timing(received: Path, published_ns: Mapping[int, int]) -> Timing | None:
+    """Of the JSON lines that the fix listener wrote, and when the image of each stamp was published; None
+    without a fix."""
     records = [json.loads(line) for line in received.read_text().splitlines()]
     arrivals = {int(r["stamp_ns"]): int(r["received_ns"]) for r in records if r["fix"]}
     late_s = [1e-9 * (at - published_ns[stamp]) for stamp, at in arrivals.items() if stamp in published_ns]
     if not late_s:
-        return Timing(*4 * (float("nan"),))
+        return None
     flight_s = 1e-9 * np.array([*sorted(arrivals), max(published_ns)], dtype=np.float64)
-    gaps_s = np.diff(flight_s)
     median, p95 = np.percentile(late_s, [50.0, 95.0])
-    span_s = float(flight_s[-1] - flight_s[0])
-    rate = len(arrivals) / span_s if span_s > 0.0 else float("nan")
-    return Timing(rate, float(gaps_s.max()), float(median), float(p95))
+    span_s = max(float(flight_s[-1] - flight_s[0]), 1.0)
+    return Timing(len(arrivals) / span_s, float(np.diff(flight_s).max()), float(median), float(p95))

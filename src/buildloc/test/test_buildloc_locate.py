@@ -354,7 +354,7 @@ def test_info_prints_what_the_database_is(folder: Path, capsys: pytest.CaptureFi
     lines = capsys.readouterr().out.splitlines()
     told = dict(line.strip().split(maxsplit=1) for line in lines)
     database = open_database(folder / "town.bldb", MatcherConfig())
-    assert told["format"] == "buildloc-reference 2" and told["CRS"] == f"EPSG:{UTM}"
+    assert told["format"] == "buildloc-reference 3" and told["CRS"] == f"EPSG:{UTM}"
     assert told["stars"] == f"{database.stars:,}" and told["buildings"] == f"{len(database):,}"
     west, south, east, north = database.bounds_m
     assert told["bounds"].startswith(f"{west:.0f} {south:.0f} {east:.0f} {north:.0f} m")
@@ -390,4 +390,4 @@ def test_a_damaged_database_is_refused_by_every_command(
     manifest = json.loads((path / MANIFEST).read_text())
     (path / MANIFEST).write_text(json.dumps(manifest | {"version": 1}))
     for command in (("locate", path, folder / "map.geojson"), ("refdb", "info", path)):
-        assert "has version 1, not 2; build it again" in refused(capsys, *command)
+        assert "has version 1, not 3; build it again" in refused(capsys, *command)

@@ -10,6 +10,7 @@ import numpy as np
 from buildloc.records import read_fixes
 from buildloc.replay import Replay, ReplayReport, replay
 from buildloc.settings import NODES, Settings
+from buildloc.timing import Timing
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.reference.database import ReferenceDatabase
 from buildloc_matcher.selection import mutual_pairs
@@ -27,6 +28,7 @@ class LiveFlight:
     results: tuple[Fix | NoFix, ...]
     scored: FlightScore
     report: ReplayReport
+    timing: Timing | None
     table: str
     summary: str
     picture: Path
@@ -76,4 +78,7 @@ def evaluate_live(
         f"{report.keyframes} keyframes, {report.maps} maps, {report.maps_skipped} overtaken, "
         f"{report.seconds:.0f} s"
     )
-    return LiveFlight(tuple(results), scored, report, fix_table(scored, truth), summary, drawn)
+    if played.timing is not None:
+        summary += "\n" + played.timing.line()
+    table = fix_table(scored, truth)
+    return LiveFlight(tuple(results), scored, report, played.timing, table, summary, drawn)

@@ -96,13 +96,17 @@ class ObservedMap:
         """(2,) true place of the mean of the map's buildings, carried there by the buildings around it: in a
         map that bends, the mean of the true places lies elsewhere."""
         points = self.local_map.centroids_m
-        centre = points.mean(axis=0)
-        near = np.argsort(np.sum((points - centre) ** 2, axis=1))[:CARRIERS]
-        source, target = points[near] @ (1.0, 1.0j), self.true_m[near] @ (1.0, 1.0j)
-        middle, place = source.mean(), target.mean()
-        turn = np.vdot(source - middle, target - place) / np.vdot(source - middle, source - middle).real
-        moved = place + turn * (complex(centre[0], centre[1]) - middle)
-        return np.array([moved.real, moved.imag])
+        return true_place(points, self.true_m, points.mean(axis=0))
+
+
+def true_place(points_m: FloatArray, true_m: FloatArray, at_m: FloatArray) -> FloatArray:
+    """(2,) where a place of a map truly lies, by the buildings (N, 2) around it and their true places."""
+    near = np.argsort(np.sum((points_m - at_m) ** 2, axis=1))[:CARRIERS]
+    source, target = points_m[near] @ (1.0, 1.0j), true_m[near] @ (1.0, 1.0j)
+    middle, place = source.mean(), target.mean()
+    turn = np.vdot(source - middle, target - place) / np.vdot(source - middle, source - middle).real
+    moved = place + turn * (complex(at_m[0], at_m[1]) - middle)
+    return np.array([moved.real, moved.imag])
 
 
 def fly_path(start_m: FloatArray, rng: np.random.Generator) -> FloatArray:

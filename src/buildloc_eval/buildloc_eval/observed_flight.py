@@ -76,12 +76,14 @@ def everywhere(buildings: Buildings) -> Flown:
 
 @dataclass(frozen=True)
 class ObservedFlight:
-    """What a matcher is given, and the truth in the frame of the ground flown over: the camera's place (2,) m
-    at the last keyframe and the heading of image-right; the length of the flight."""
+    """What a matcher is given, and the truth in the frame of the ground flown over: places (N, 2) m of the
+    map's buildings, that of the camera (2,) at the last keyframe and the heading of image-right; the flight's
+    length."""
 
     local_map: LocalMap
     keyframes: tuple[Keyframe, ...]
     observations: tuple[FrameObservation, ...]
+    true_m: FloatArray
     camera_m: FloatArray
     yaw_rad: float
     path_m: float
@@ -151,7 +153,9 @@ def _observed(
         FrameObservation(int(stamps[k]), levels[frame == k], scale * ALTITUDE_M) for k in latest
     )
     length = float(steps[-1] * STEP_M)
-    return ObservedFlight(local_map, keyframes, observations, path[steps[-1]], float(heading[-1]), length)
+    return ObservedFlight(
+        local_map, keyframes, observations, met.true_m, path[steps[-1]], float(heading[-1]), length
+    )
 
 
 def mirrored(flight: ObservedFlight) -> ObservedFlight:

@@ -20,15 +20,24 @@ from pyproj import Transformer
 from buildloc_eval.truth import Truth
 
 VIEW_MARGIN_M = 120.0
+CHI2_95 = 5.991  # of two degrees of freedom: 95 % of the normalised squared errors of honest fixes are below
+TOLD_NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
 class FlightScore:
-    """Fixes with their errors in metres, in order, and the number of answers without a fix."""
+    """Fixes with their errors in metres, in order, and the number of answers without a fix. ``normalised``:
+    horizontal errors squared, over the fixes' own covariances."""
 
     fixes: tuple[Fix, ...]
     errors_m: tuple[float, ...]
+    normalised: tuple[float, ...]
     no_fix: int
+
+    @property
+    def covered(self) -> float | None:
+        """Share of the fixes whose 95 % ellipse holds the truth; None when there was none."""
+        return float(np.mean(np.array(self.normalised) < CHI2_95)) if self.normalised else None
 
     @property
     def last_error_m(self) -> float | None:
@@ -39,14 +48,23 @@ class FlightScore:
 def score(results: Sequence[Fix | NoFix], truth: Truth) -> FlightScore:
     """Errors of all fixes against the truth of their own stamps."""
     fixes = tuple(r for r in results if isinstance(r, Fix))
-    return FlightScore(fixes, tuple(truth.error_m(f) for f in fixes), len(results) - len(fixes))
+    offsets = [truth.offset_m(f) for f in fixes]
+    normalised = tuple(
+        float(offset @ np.linalg.solve(f.covariance_enu_m2[:2, :2], offset))
+        for f, offset in zip(fixes, offsets, strict=True)
+    )
+    errors = tuple(float(np.hypot(*offset)) for offset in offsets)
+    return FlightScore(fixes, errors, normalised, len(results) - len(fixes))
 
 
 def fix_table(scored: FlightScore, truth: Truth) -> str:
-    """One line per fix: time since the first image, position, sigma, error."""
-    start = min(truth.poses)
+    """One line per second with a fix: time since the first image, position, sigma, error."""
+    start, told = min(truth.poses), -TOLD_NS
     lines = ["  time_s    latitude    longitude  sigma_m  error_m"]
     for fix, error in zip(scored.fixes, scored.errors_m, strict=True):
+        if fix.stamp_ns - told < TOLD_NS:
+            continue
+        told = fix.stamp_ns
         sigma = float(np.sqrt(np.trace(fix.covariance_enu_m2[:2, :2]) / 2.0))
         lines.append(
             f"{(fix.stamp_ns - start) * 1e-9:8.1f}  {fix.latitude_deg:10.6f}  {fix.longitude_deg:11.6f}  "

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from buildloc.bag import open_bag, raw_messages
 from buildloc_msgs_py import topics
 from buildloc_msgs_py.errors import BuildlocError
-from buildloc_msgs_py.types import Fix
+from buildloc_msgs_py.types import Fix, FloatArray
 from buildloc_msgs_py.wire import stamp_ns
 from pyproj import Transformer
 
@@ -36,14 +38,22 @@ class Truth:
     epsg: int
     poses: dict[int, TruePose]
 
-    def error_m(self, fix: Fix) -> float:
-        """Horizontal distance of a fix to the truth of its own stamp; raises TruthError without one."""
+    def offset_m(self, fix: Fix) -> FloatArray:
+        """(2,) east and north from the truth of its own stamp to a fix; raises TruthError without one."""
         pose = self.poses.get(fix.stamp_ns)
         if pose is None:
             raise TruthError(f"fix at {fix.stamp_ns} has no ground truth; is it from another bag?")
-        to_utm = Transformer.from_crs(4326, self.epsg, always_xy=True)
-        east, north = to_utm.transform(fix.longitude_deg, fix.latitude_deg)
-        return math.hypot(east - pose.x_m, north - pose.y_m)
+        east, north = _to_utm(self.epsg).transform(fix.longitude_deg, fix.latitude_deg)
+        return np.array([east - pose.x_m, north - pose.y_m])
+
+    def error_m(self, fix: Fix) -> float:
+        """Horizontal distance of a fix to the truth of its own stamp; raises TruthError without one."""
+        return math.hypot(*self.offset_m(fix))
+
+
+@cache
+def _to_utm(epsg: int) -> Transformer:
+    return Transformer.from_crs(4326, epsg, always_xy=True)
 
 
 def read_truth(bag: Path) -> Truth:

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import argparse
+import json
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
+from buildloc_eval.cli import add_eval_arguments, run_eval
+from buildloc_eval.integrity import run as runner
+from buildloc_eval.integrity import scoring
+from buildloc_eval.integrity.evaluate import plan_of
 from buildloc_eval.integrity.grounds import GridDesign, Grounds, Source, grid_design, grid_town
 from buildloc_eval.integrity.plan import (
     CALIBRATION,
     CONTROLS,
     FLIGHT,
     GRID,
+    PAPER_EVERY,
     SCATTERED,
     TEST,
     TOWN_NONE,
@@ -24,10 +34,13 @@ from buildloc_eval.integrity.plan import (
     shift_of,
     trial,
 )
+from buildloc_eval.integrity.report import report_of, write
 from buildloc_eval.integrity.trials import attempt, other_city, run
+from buildloc_eval.paper.store import StaleError
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.reference.buildings import Buildings, concatenate
 from buildloc_matcher.reference.region import WGS84, Circle, transformer
+from buildloc_msgs_py.errors import BuildlocError
 from pyproj import CRS
 from scipy.spatial import cKDTree
 
@@ -41,16 +54,16 @@ def invented(name: str) -> Source:
     latitude, longitude = CENTRES_DEG[name]
     east, north = transformer(CRS(WGS84), CRS(ZONES[name])).transform(longitude, latitude)
     rng = np.random.default_rng(len(name) + ord(name[0]))
-    points = rng.uniform(-1000.0 * KM, 1000.0 * KM, (9000, 2))
+    points, others = rng.uniform(-1000.0 * KM, 1000.0 * KM, (2, 9000, 2))
     areas = np.exp(rng.normal(5.0, 0.5, 9000)).astype(np.float32)
     shapes = rng.uniform(0.5, 1.0, (9000, 4)).astype(np.float32)
     town = Buildings(np.add(points, (east, north)), areas, shapes)
-    away = Buildings(np.add(points[::-1], (east, north + 4600.0)), areas, shapes)
+    away = Buildings(np.add(others, (east, north + 4600.0)), areas, shapes)
     return Source(ZONES[name], concatenate([town, away]))
 
 
 PLACES = tuple(Place(name, name, name, name, CENTRES_DEG[name], (KM,), KM) for name in ZONES)
-TINY = Plan("test", PLACES, {name: Territory((Circle(*CENTRES_DEG[name], 20.0),)) for name in ZONES})
+TINY = Plan("test", 5, PLACES, {name: Territory((Circle(*CENTRES_DEG[name], 20.0),)) for name in ZONES})
 
 
 @pytest.fixture(scope="module")
@@ -66,17 +79,23 @@ def first(kind: str, detail: str = "") -> int:
     return next(n for n in numbers if detail in trial(TINY, 1, n).detail)
 
 
-def test_a_fifth_of_all_trials_are_controls_of_equal_kinds_everywhere() -> None:
-    for plan in (TEST, CALIBRATION):
-        drawn = [trial(plan, 1, n) for n in range(4000)]
-        assert Counter(one.kind for one in drawn) == {FLIGHT: 3200} | dict.fromkeys(CONTROLS, 100)
-        for place in plan.places:
-            here = {one.kind for one in drawn if one.place == place}
-            assert here == {FLIGHT, *CONTROLS}
-        largest = [one.radius_km == one.place.radii_km[-1] for one in drawn if not one.control]
-        assert np.mean(largest) == pytest.approx(0.7, abs=0.03)
-        # The paper's preset is tried on all kinds alike.
-        assert {one.kind for one in drawn if one.paper} == {FLIGHT, *CONTROLS}
+@pytest.mark.parametrize(("plan", "flights"), [(TEST, 3200), (CALIBRATION, 0)], ids=["test", "calibration"])
+def test_controls_of_equal_kinds_everywhere(plan: Plan, flights: int) -> None:
+    drawn = [trial(plan, 1, n) for n in range(4000)]
+    kinds = dict.fromkeys(CONTROLS, (4000 - flights) // len(CONTROLS)) | (
+        {FLIGHT: flights} if flights else {}
+    )
+    assert Counter(one.kind for one in drawn) == kinds
+    for place in plan.places:
+        assert {one.kind for one in drawn if one.place == place} == set(kinds)
+    # The paper's preset is tried on all kinds alike.
+    assert {one.kind for one in drawn if one.paper} == set(kinds)
+
+
+def test_most_flights_are_searched_for_in_the_largest_reference() -> None:
+    drawn = [trial(TEST, 1, n) for n in range(4000)]
+    largest = [one.radius_km == one.place.radii_km[-1] for one in drawn if not one.control]
+    assert np.mean(largest) == pytest.approx(0.7, abs=0.03)
 
 
 def test_a_trial_is_that_of_its_number_seed_and_plan() -> None:
@@ -141,7 +160,7 @@ def test_ground_that_is_absent_is_absent(grounds: Grounds) -> None:
         one = trial(TINY, 1, number)
         tried = attempt(one, grounds)
         assert one.absent and one.control
-        distance, _ = cKDTree(tried.database.centroids_m).query(tried.truth_m)
+        distance, _ = cKDTree(tried.database.centroids_m).query(tried.camera_m)
         if kind != "mirrored":
             assert distance > 900.0
     assert trial(TINY, 1, first("grid suburbs", "absent")).absent
@@ -185,3 +204,128 @@ def test_the_footprints_of_a_run_are_read_once(grounds: Grounds) -> None:
         raise AssertionError(name)
 
     Grounds(Path(grounds.folder), TINY, 1, MatcherConfig()).build(never, lambda _: None)
+
+
+@pytest.fixture(scope="module")
+def records(grounds: Grounds) -> pd.DataFrame:
+    """Trials that the paper's preset is tried on too: flights and controls of both towns."""
+    return pd.DataFrame([run(n, grounds) for n in range(0, 330, PAPER_EVERY)])
+
+
+def test_where_the_papers_argmax_is_wrong_ours_is_right_or_has_no_fix(records: pd.DataFrame) -> None:
+    assert records.absent.sum() >= 2 and (~records.control).sum() >= 20
+    wrong = records[records.paper_answers.astype(bool) & ~(records.paper_error_m <= 100.0)]
+    assert records[records.absent].number.isin(wrong.number).all()  # it always answers
+    assert not scoring.is_false(records).any()
+    flights = records[~records.control]
+    assert (flights.fixed & (flights.fix_error_m <= 100.0)).sum() >= 0.5 * len(flights)
+    rows = scoring.beside_paper(records)
+    assert [row["false"] for row in rows if row["method"] == "ours"] == [0, 0]
+    assert sum(row["false"] for row in rows if row["method"] != "ours") == len(wrong) > 0
+
+
+def test_the_report_is_made_of_the_trials(records: pd.DataFrame, tmp_path: Path) -> None:
+    report = report_of(records, TINY, 30_000, 1, real="simulated: two invented towns")
+    said = write(tmp_path, report, records)
+    kept = json.loads((tmp_path / "report.json").read_text())
+    assert kept["trials"] == len(records) and kept["false fixes"] == []
+    # No false fix, but in fewer trials than the bar is of: neither met nor missed, up to the rule of three.
+    zero = kept["bars"][0]
+    assert zero["met"] == "-" and zero["reached"]["95%"] == [0.0, 3.0 / len(records)]
+    assert sum(row["trials"] for row in kept["controls"]) == records.control.sum()
+    fixes = scoring.consistent(records)
+    assert kept["consistency"][0]["fixes"] == len(fixes) > 10
+    assert any("horizontal error" in row["what"] and row["met"] == "met" for row in kept["bars"])
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 5 and "two invented towns" in page
+    assert "two invented towns" in said and "false" in said
+
+
+def test_shares_have_exact_intervals_and_nothing_has_the_rule_of_three() -> None:
+    assert scoring.share(0, 300) == {"share": 0.0, "of": 300, "95%": [0.0, 0.01]}
+    half = scoring.share(5, 10)
+    assert half["95%"] == pytest.approx([0.187, 0.813], abs=1e-3)  # Clopper and Pearson's own table
+    assert scoring.share(0, 0)["share"] is None
+
+
+def made_up(**columns: Any) -> pd.DataFrame:
+    """Four trials: a right fix, a refinement led astray, an accepted wrong place, a control refused."""
+    rows = {
+        "number": [0, 1, 2, 4], "place": "town", "kind": [FLIGHT, FLIGHT, FLIGHT, "outside"], "detail": "",
+        "control": [False, False, False, True], "absent": [False, False, False, True], "radius_km": 12.0,
+        "buildings": 60, "level": 1, "shift_m": 0.0, "fixed": [True, True, True, False],
+        "score": [40.0, 30.0, 20.0, 1.0], "false_fix_probability": [1e-9, 1e-6, 1e-5, 0.1],
+        "best_error_m": [5.0, 6.0, 900.0, np.inf], "fix_error_m": [1.0, 150.0, 901.0, np.nan],
+        "candidate_error_m": [[5.0], [6.0], [900.0, 4.0], [np.inf]],
+        "candidate_jaccard": [[0.6]] * 4, "candidate_pairs": [[40]] * 4, "candidate_rms_m": [[2.0]] * 4,
+        "funnel.log_odds": 50.0, "funnel.lead": 30.0, "reason": ["", "", "", "undecided: score 1.0 nats"],
+        "nees": [0.5, 30.0, 900.0, np.nan], "var_east_m2": 4.0, "var_north_m2": 1.0, "cov_east_north_m2": 0.0,
+    }  # fmt: skip
+    return pd.DataFrame(rows | columns)
+
+
+def test_false_fixes_are_counted_and_told_apart() -> None:
+    trials = made_up()
+    assert scoring.is_false(trials).tolist() == [False, True, True, False]
+    reasons = [row["reason"] for row in scoring.false_rows(trials)]
+    assert "refinement led away" in reasons[0] and "true place was candidate 2" in reasons[1]
+    lost = scoring.false_rows(made_up(absent=True, kind="outside", fix_error_m=np.inf))
+    assert len(lost) == 3 and all("not in the reference" in row["reason"] for row in lost)
+    assert scoring.bars(trials, 4)[0]["met"] == "missed"
+    none_false = trials[~scoring.is_false(trials)]
+    assert [scoring.bars(none_false, asked)[0]["met"] for asked in (2, 4)] == ["met", "-"]
+
+
+def test_the_curve_trades_availability_for_false_fixes() -> None:
+    rows = {row["threshold"]: row for row in scoring.our_curve(made_up(), 15.0)}
+    assert rows[15.0]["false fixes"] == 2 and rows[15.0]["availability"]["share"] == pytest.approx(1.0 / 3.0)
+    assert rows[0.0]["false fixes"] == 3  # the control's best candidate, which the score refused
+    refused = scoring.our_curve(made_up(fixed=[True, False, False, False]), 15.0)
+    assert [row["false fixes"] for row in refused if row["threshold"] == 15.0] == [0]
+
+
+def test_consistency_counts_errors_within_their_bounds() -> None:
+    row = scoring.consistency(made_up())[0]  # of the one right fix
+    assert row["fixes"] == 1 and row["within 95 % bound"]["share"] == 1.0
+    # The longer axis has 2 m: 2 sqrt(13.82) m are exceeded once in a thousand.
+    assert row["median protection level_m"] == pytest.approx(7.434, abs=1e-3)
+    reliability = scoring.tail_reliability(made_up())
+    assert reliability[0]["observed"] == scoring.share(2, 2)  # trials 2 and 4 have a wrong best candidate
+    assert reliability[-1] == {"claimed": 1e-5, "observed": scoring.share(1, 2)}
+    odds = {row["nats"]: row["observed right"]["share"] for row in scoring.odds_reliability(made_up())}
+    assert odds == {"0 to 2": 0.0, "20 to inf": pytest.approx(2.0 / 3.0)}
+
+
+def test_a_run_goes_on_where_it_was_and_refuses_what_another_seed_made(
+    tmp_path: Path, grounds: Grounds, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran: list[range] = []
+
+    def here(_: Grounds, chunks: list[range]) -> Iterator[tuple[range, pd.DataFrame]]:
+        for chunk in chunks:
+            ran.append(chunk)
+            yield chunk, pd.DataFrame({"number": list(chunk)})
+
+    monkeypatch.setattr(runner, "_side_by_side", here)
+    monkeypatch.setattr(Grounds, "build", lambda *_: None)
+    assert len(runner.run_all(tmp_path, TINY, 150, 1, lambda _: None)) == 150
+    assert ran == [range(100), range(100, 150)]
+    told: list[str] = []
+    assert len(runner.run_all(tmp_path, TINY, 250, 1, told.append)) == 250
+    assert ran[2:] == [range(100, 200), range(200, 250)] and told[-1].startswith("250 of 250")
+    assert runner.run_all(tmp_path, TINY, 50, 1, lambda _: None).number.tolist() == list(range(50))
+    with pytest.raises(StaleError, match="another seed"):
+        runner.run_all(tmp_path, TINY, 50, 2, lambda _: None)
+
+
+def test_the_command_knows_plans_and_trials() -> None:
+    parser = argparse.ArgumentParser()
+    add_eval_arguments(parser)
+    asked = parser.parse_args(["integrity", "--out", "x", "--plan", "calibration", "--trials", "3000"])
+    assert (asked.plan, asked.trials) == ("calibration", 3000)
+    with pytest.raises(BuildlocError, match="are of `eval integrity`"):
+        run_eval(parser.parse_args(["scale", "--out", "x", "--trials", "3"]))
+    with pytest.raises(SystemExit):
+        parser.parse_args(["integrity", "--out", "x", "--trials", "0"])
+    quick = plan_of("test", quick=True)
+    assert {place.city for place in quick.places} == {"Boston", "Tokyo"} and quick.name != TEST.name

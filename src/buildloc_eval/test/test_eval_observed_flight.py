@@ -64,6 +64,7 @@ def test_the_true_pose_of_the_last_keyframe_puts_an_errorless_map_on_its_buildin
     flight, tree = flown(PERFECT, seed), town().tree
     distance, row = tree.query(to_world(flight).apply(flight.local_map.centroids_m))
     assert distance.max() < 1e-6 and len(np.unique(row)) == 60
+    np.testing.assert_allclose(flight.true_m, to_world(flight).apply(flight.local_map.centroids_m), atol=1e-6)
     seen, _ = tree.query(to_world(flight).apply(in_map(flight)))
     assert seen.max() < 1e-6
     last = flight.observations[-1]

@@ -14,6 +14,9 @@ class MapperConfig:
     registration: str = param("sift", "matching method: sift, xfeat, coarse_loftr or loftr")
     registration_model: str = param("", "ONNX file of the matching method's weights; none for sift")
     level_width_px: int = param(960, "images wider than this are shrunk when made level, px", 100, 10000)
+    track_width_px: int = param(
+        480, "images wider than this are shrunk to be tracked between keyframes, px", 100, 10000
+    )
     features: int = param(2000, "features per keyframe", 50, 20000)
     feature_width_px: int = param(640, "level images wider than this are shrunk before SIFT, px", 100, 10000)
     match_ratio: float = param(0.8, "nearest to second-nearest descriptor distance (ratio test)", 0.1, 1.0)

@@ -90,7 +90,7 @@ class Mapper:
             T_new_old = graph.poses[keyframe].inverse().compose(graph.poses[before])  # noqa: N806
         update = self._update(keyframe, started)
         # Only now: whoever is told of a frame tracked in this keyframe is to know the keyframe.
-        self._tracker.rebase(frame.stamp_ns, self._atlas.prepared(keyframe), T_new_old)
+        self._tracker.rebase(frame, self._atlas.prepared(keyframe), T_new_old)
         return update
 
     def track(self, frame: Frame) -> Tracked | Lost:

@@ -50,6 +50,14 @@ class Prepared:
 
 
 @dataclass(frozen=True)
+class Guide:
+    """A keyframe as frames are tracked against it: level ground, and corners (N, 2) px."""
+
+    level: LevelImage
+    corners_uv: FloatArray
+
+
+@dataclass(frozen=True)
 class Packed:
     """A prepared frame whose image is compressed."""
 
@@ -120,6 +128,11 @@ class Registration:
         described = features if isinstance(self._method, Sift) else self._landmarks.prepare(level.grey)
         return Prepared(level, corners(level), features, signature(described))
 
+    def prepare_to_follow(self, frame: Frame) -> Guide:
+        """Level ground and corners of a keyframe that others are to follow at camera rate."""
+        level = level_image(frame, self._config.track_width_px)
+        return Guide(level, corners(level))
+
     def register(
         self, earlier: Prepared, later: Prepared, turned_rad: float | None = None
     ) -> Link | Rejection:
@@ -138,7 +151,7 @@ class Registration:
             answers.append(answer)
         return answers[0]
 
-    def follow(self, earlier: Prepared, later: LevelImage, rough: Similarity) -> Link | Rejection:
+    def follow(self, earlier: Prepared | Guide, later: LevelImage, rough: Similarity) -> Link | Rejection:
         """The later image's pose in the earlier keyframe where it is known to some 15 pixels, by its corners
         alone: a fraction of the cost of :meth:`register`."""
         step = max(1, len(earlier.corners_uv) // FOLLOWED)

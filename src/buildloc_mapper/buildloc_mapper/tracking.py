@@ -11,7 +11,7 @@ from buildloc_msgs_py.types import Frame, Tracked
 
 from buildloc_mapper.config import MapperConfig
 from buildloc_mapper.level import level_image
-from buildloc_mapper.registration import Link, Prepared, Registration, Rejection, link_covariance
+from buildloc_mapper.registration import Guide, Link, Prepared, Registration, Rejection, link_covariance
 from buildloc_mapper.similarity import Similarity
 
 NOWHERE = Similarity(0.0, 0.0, 0.0, 1.0)
@@ -46,6 +46,7 @@ class _Base:
     """The keyframe that frames are tracked against."""
 
     stamp_ns: int
+    guide: Guide
     prepared: Prepared
 
 
@@ -63,10 +64,11 @@ class Tracker:
         self._base: _Base | None = None
         self._motion: _Motion | None = None
 
-    def rebase(self, stamp_ns: int, prepared: Prepared, T_new_old: Similarity | None) -> None:  # noqa: N803
+    def rebase(self, keyframe: Frame, prepared: Prepared, T_new_old: Similarity | None) -> None:  # noqa: N803
         """Track against another keyframe from the next frame on, in which the one before lies at
         ``T_new_old``; None: unknown. It may come from another thread than :meth:`track`."""
-        self._rebases.append((_Base(stamp_ns, prepared), T_new_old))
+        guide = self._registration.prepare_to_follow(keyframe)
+        self._rebases.append((_Base(keyframe.stamp_ns, guide, prepared), T_new_old))
 
     def _take_over(self) -> None:
         while self._rebases:
@@ -95,8 +97,8 @@ class Tracker:
 
     def _follow(self, base: _Base, frame: Frame) -> Link | Rejection:
         start = self._motion or _Motion(base.stamp_ns, NOWHERE, NOWHERE, 0.0)
-        level = level_image(frame, self._config.level_width_px)
-        return self._registration.follow(base.prepared, level, start.at(frame.stamp_ns))
+        level = level_image(frame, self._config.track_width_px)
+        return self._registration.follow(base.guide, level, start.at(frame.stamp_ns))
 
     def _moved(self, stamp_ns: int, pose: Similarity) -> None:
         before, seconds = self._motion, 0.0

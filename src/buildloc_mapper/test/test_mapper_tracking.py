@@ -33,7 +33,7 @@ def tracked(tracker: Tracker, frame: Frame) -> Tracked:
 
 def based(frame: Frame) -> Tracker:
     tracker = Tracker(CONFIG, REGISTRATION)
-    tracker.rebase(frame.stamp_ns, REGISTRATION.prepare(frame), None)
+    tracker.rebase(frame, REGISTRATION.prepare(frame), None)
     return tracker
 
 
@@ -74,7 +74,7 @@ def test_what_cannot_be_tracked_is_lost_and_the_next_frame_is_not() -> None:
 def test_before_the_first_keyframe_and_after_a_reset_there_is_nothing_to_track_against() -> None:
     tracker = Tracker(CONFIG, REGISTRATION)
     assert tracker.track(at(1, 0.0, 0.0)) == Lost(TENTH, "no_keyframe")
-    tracker.rebase(0, REGISTRATION.prepare(at(0, 0.0, 0.0)), None)
+    tracker.rebase(at(0, 0.0, 0.0), REGISTRATION.prepare(at(0, 0.0, 0.0)), None)
     tracked(tracker, at(1, 0.0, 0.0))
     tracker.reset()
     assert tracker.track(at(2, 0.0, 0.0)) == Lost(2 * TENTH, "no_keyframe")
@@ -86,7 +86,7 @@ def test_a_new_keyframe_takes_the_motion_over() -> None:
         tracked(tracker, at(4 * i, -20.0 + 8.0 * i, 0.0))
     # 32 m from the old keyframe, 12 m from the new one: 80 px, far beyond what corners can be followed from.
     keyframe = at(11, 0.0, 0.0)
-    tracker.rebase(keyframe.stamp_ns, REGISTRATION.prepare(keyframe), Similarity(-20.0, 0.0, 0.0, 1.0))
+    tracker.rebase(keyframe, REGISTRATION.prepare(keyframe), Similarity(-20.0, 0.0, 0.0, 1.0))
     found = tracked(tracker, at(16, 12.0, 0.0))
     assert found.keyframe_ns == keyframe.stamp_ns
     assert (found.x_m, found.y_m) == pytest.approx((12.0, 0.0), abs=0.1)

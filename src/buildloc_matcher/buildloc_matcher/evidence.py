@@ -39,23 +39,26 @@ MOST_CHANCE = 0.9
 
 @dataclass(frozen=True)
 class Ground:
-    """The buildings of the reference (N, 2) and their areas (N,), the same places in a grid, and how dense
-    they lie: (rows, columns) in cells of DENSITY_CELL_M."""
+    """The buildings of the reference (N, 2) and their areas (N,), the same places in a grid, how dense they
+    lie: (rows, columns) in cells of DENSITY_CELL_M; and their outlines as ``Buildings`` has them, or None."""
 
     buildings_m: FloatArray
     areas_m2: NDArray[np.floating]
     grid: PointGrid
     density_per_m2: FloatArray
+    outlines: NDArray[np.int16] | None = None
 
 
-def ground(buildings_m: FloatArray, areas_m2: NDArray[np.floating]) -> Ground:
+def ground(
+    buildings_m: FloatArray, areas_m2: NDArray[np.floating], outlines: NDArray[np.int16] | None = None
+) -> Ground:
     """Buildings (N, 2) with areas (N,) in a grid; the density is averaged over three by three cells."""
     grid = grid_points(buildings_m)
     column, row = ((grid.points_m - (grid.west_m, grid.south_m)) // DENSITY_CELL_M).astype(np.int64).T
     counts = np.zeros((row.max() + 1, column.max() + 1))
     np.add.at(counts, (row, column), 1.0)
     mean = uniform_filter(counts, DENSITY_CELLS, mode="constant") / DENSITY_CELL_M**2
-    return Ground(buildings_m, areas_m2, grid, np.maximum(mean, MIN_DENSITY_PER_M2))
+    return Ground(buildings_m, areas_m2, grid, np.maximum(mean, MIN_DENSITY_PER_M2), outlines)
 
 
 def density_at(points_m: FloatArray, reference: Ground) -> FloatArray:

@@ -267,15 +267,16 @@ class Matcher:
         config, reference = self.config, self.database.ground
         last = max(keyframes, key=lambda k: k.stamp_ns)
         refined = refine(predicted, keyframes, observations, reference, config)
-        poses = _placed(predicted, keyframes) if isinstance(refined, Unrefined) else _refined(refined)
+        poses = _refined(refined) if isinstance(refined, Refined) else _placed(predicted, keyframes)
         offset = np.array(poses[last.stamp_ns]) - np.array(_placed(predicted, [last])[last.stamp_ns])
         offset[2] = wrap(offset[2])
         seen = seen_in_world(poses, observations, config.follow_frames)
         opinion = ask(seen, offset[:2], covariance, reference, config)
-        if isinstance(refined, Unrefined) or opinion.outcome is not Outcome.ACCEPTED:
+        if opinion.outcome is not Outcome.ACCEPTED:
             return Followed(opinion, None)
-        if (refused := refuse_refined(refined, config)) is not None:
-            return Followed(replace(opinion, outcome=Outcome.UNDECIDED, reason=refused), None)
+        refused = refined.reason if isinstance(refined, Unrefined) else refuse_refined(refined, config)
+        if isinstance(refined, Unrefined) or refused is not None:
+            return Followed(replace(opinion, outcome=Outcome.UNDECIDED, reason=refused or ""), None)
         apart = sigmas_apart(offset, covariance + refined.covariance)
         if apart > config.max_jump_sigmas:
             jump = f"the place jumped by {math.hypot(*offset[:2]):.1f} m, {apart:.1f} standard deviations"

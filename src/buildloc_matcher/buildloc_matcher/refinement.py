@@ -5,33 +5,40 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from buildloc_msgs_py.types import FloatArray, FrameObservation, Keyframe
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.evidence import Ground
 from buildloc_matcher.geometry import Similarity, fit_rigid, wrap
+from buildloc_matcher.outline_fit import walls
 from buildloc_matcher.point_grid import within
+from buildloc_matcher.reference.buildings import OUTLINE_UNIT_M
 from buildloc_matcher.window import (
-    CAUCHY,
+    Pairing,
     Solution,
     State,
     Window,
     associate,
+    associate_outlines,
+    cauchy,
     make_window,
     placed,
     solve,
     start,
+    start_sigma_m,
 )
 
 RIVAL_M = 20.0  # another optimum is sought within this distance
 RIVAL_CELL_M = 3.0
 RIVAL_TURN_RAD = math.radians(4.0)
 RIVALS = 4  # shifts tried
-RIVAL_ROUNDS = 4
-RIVAL_POINTS = 150  # of the observations: enough to tell one place from another
+SETTLING_ROUNDS = 3
+SOME = 80  # observations: enough to tell one place from another
 SAME_M = 2.0  # optima nearer than this, or than three sigma, are one
 ONE_BUILDING_M = 3.0
 
@@ -73,8 +80,10 @@ def refine(
     """Correct where ``coarse`` (map -> world) puts the last ``refine_frames`` keyframes.
 
     All of them are moved as one first, by nearest neighbours within a distance that shrinks from
-    ``refine_distance_m`` to ``refine_last_distance_m``; then each by itself (see :mod:`window`). Refused with
-    fewer than three pairs, or where the same buildings fit nearly as well at another place near by.
+    ``refine_distance_m`` to ``refine_last_distance_m``; there and at places like it, outlines are put onto
+    the walls of the reference, or centroids onto centroids; from the best place each keyframe is moved by
+    itself (see :mod:`window`). Refused with fewer than three pairs, or where another place fits nearly as
+    well.
     """
     last = sorted(keyframes, key=lambda k: k.stamp_ns)[-config.refine_frames :]
     window = make_window(last, observations) if last else None
@@ -87,64 +96,90 @@ def refine(
     if len(rows) < 3:
         return NO_BUILDINGS
     tree = cKDTree(reference.buildings_m[rows])
-    shrink = np.geomspace(config.refine_distance_m, config.refine_last_distance_m, config.refine_iterations)
-    moved = _moved_as_one(window, state, tree, shrink)
-    solution = moved and solve(window, moved, tree, config.refine_last_distance_m, config)
-    if not solution:
+    moved = state
+    for distance_m in np.geomspace(
+        config.refine_distance_m, config.refine_last_distance_m, config.refine_iterations
+    ):
+        moved = _moved_as_one(window, moved, partial(associate, reference=tree, distance_m=distance_m))
+    starts = [moved, state, *(moved.moved(by) for by in _elsewhere(placed(window, moved), tree))]
+    for pairing in _pairings(window, reference, rows, tree, config):
+        optima = _Optima(window, state, starts, pairing, config)
+        solution = solve(window, optima.best, pairing, config)
+        if solution is not None:
+            break
+    else:
         return NO_BUILDINGS
+    rival_m = optima.rival_m(solution)
+    if rival_m is not None:
+        return Unrefined(f"refinement found two optima {rival_m:.1f} m apart that fit alike")
     covariance = solution.covariance + np.diag([*2 * [config.sigma_registration_m**2], 0.0])
-    rival = _rival_m(window, solution, tree, config)
-    if rival is not None:
-        return Unrefined(f"refinement found two optima {rival:.1f} m apart that fit alike")
     position, yaw = solution.state.poses[-1, :2], float(wrap(solution.state.poses[-1, 2]))
     return Refined(
         position, yaw, covariance, dict(zip(window.stamps_ns, solution.state.poses, strict=True)),
-        len(window.level_m), len(solution.pairs), len(np.unique(solution.pairs.buildings)),
+        len(window.level_m), len(solution.pairs), solution.pairs.seen,
         math.sqrt(float(np.mean(np.sum(solution.residuals_m**2, axis=1)))),
     )  # fmt: skip
 
 
-def _moved_as_one(window: Window, state: State, tree: cKDTree, distances_m: FloatArray) -> State | None:
-    """Rigid steps over all pairs while the distance shrinks; None for fewer than three pairs."""
-    points = placed(window, state)
-    for distance_m in distances_m:
-        pairs = associate(window, points, tree, distance_m)
-        if len(pairs) < 3:
-            return None
-        step = fit_rigid(points[pairs.rows], tree.data[pairs.buildings])
-        points, state = step.apply(points), state.moved(step)
-    return state
+def _pairings(
+    window: Window, reference: Ground, rows: NDArray[np.int64], tree: cKDTree, config: MatcherConfig
+) -> list[Pairing]:
+    """Outlines to the walls, if both sides have some; where hardly any fits, centroids to the nearest."""
+    nearest = partial(associate, reference=tree, distance_m=config.refine_last_distance_m)
+    if window.outlines_m is None or reference.outlines is None:
+        return [nearest]
+    about = OUTLINE_UNIT_M * reference.outlines[rows].astype(np.float64)
+    return [partial(associate_outlines, reference=walls(reference.buildings_m[rows, None] + about)), nearest]
 
 
-def _rival_m(window: Window, solution: Solution, tree: cKDTree, config: MatcherConfig) -> float | None:
-    """How far away another pose fits nearly as well as the solution, or None where there is none."""
-    points = placed(window, solution.state)
-    apart_m = max(SAME_M, 3.0 * math.sqrt(float(np.linalg.eigvalsh(solution.covariance[:2, :2])[-1])))
-    # Each building counts once, however many frames saw it.
-    views = cKDTree(points).query_ball_point(points, ONE_BUILDING_M, return_length=True)
-    few = np.linspace(0, len(points) - 1, min(len(points), RIVAL_POINTS)).astype(np.int64)
-    points, weights = points[few], len(points) / len(few) / views[few]
-    distance_m = config.refine_last_distance_m
-    scale_m = solution.growth * math.hypot(config.sigma_frame_m, config.sigma_building_m)
+def _moved_as_one(window: Window, state: State, pairing: Pairing) -> State:
+    """The rigid step that brings all pairs together best; none for fewer than three."""
+    pairs = pairing(window, state)
+    if len(pairs) < 3:
+        return state
+    return state.moved(fit_rigid(placed(window, state)[pairs.rows], pairs.targets_m))
 
-    def misfit(at_m: FloatArray) -> float:
-        distance, _ = tree.query(at_m)
-        normalised = np.minimum(distance, distance_m) / (CAUCHY * scale_m)
-        return float(weights @ (0.5 * CAUCHY**2 * np.log1p(normalised**2)))
 
-    bar = misfit(points) + config.min_optimum_lead
-    for begun in _elsewhere(points, tree):
-        moved = begun.apply(points)
-        for _ in range(RIVAL_ROUNDS):
-            distance, nearest = tree.query(moved, distance_upper_bound=distance_m)
-            near = np.isfinite(distance)
-            if near.sum() < 3:
-                break
-            moved = fit_rigid(moved[near], tree.data[nearest[near]], weights[near]).apply(moved)
-        away = math.sqrt(float(np.mean(np.sum((moved - points) ** 2, axis=1))))
-        if apart_m < away and misfit(moved) < bar:
-            return away
-    return None
+class _Optima:
+    """Where rigid steps lead from several starts, by some of the observations; and which fits best."""
+
+    def __init__(
+        self, window: Window, coarse: State, starts: Sequence[State], pairing: Pairing, config: MatcherConfig
+    ) -> None:
+        count = len(window.level_m)
+        # Each building counts once, however many frames saw it.
+        points = placed(window, starts[0])
+        views = cKDTree(points).query_ball_point(points, ONE_BUILDING_M, return_length=True)
+        few = np.linspace(0, count - 1, min(count, SOME)).astype(np.int64)
+        self._window, self._weights = window.thinned(few), count / len(few) / views[few]
+        self._coarse, self._pairing, self._config = coarse, pairing, config
+        self._states = list(starts)
+        for _ in range(SETTLING_ROUNDS):
+            self._states = [_moved_as_one(self._window, state, pairing) for state in self._states]
+        self.best = min(self._states, key=self._misfit)
+
+    def _misfit(self, state: State, growth: float = 1.0) -> float:
+        """Nats, of errors that are ``growth`` times as large as the parameters have them."""
+        sigma_m = growth * math.hypot(self._config.sigma_frame_m, self._config.sigma_building_m)
+        alone = cauchy((self._config.refine_last_distance_m / sigma_m) ** 2)
+        pairs = self._pairing(self._window, state)
+        apart = pairs.targets_m - placed(self._window, state)[pairs.rows]
+        told = np.einsum("pi,pij,pj->p", apart, pairs.certainty, apart)
+        costs = np.full(len(self._weights), alone)
+        costs[pairs.rows] += pairs.covered * np.minimum(0.0, cauchy(told / sigma_m**2) - alone)
+        away = (state.poses - self._coarse.poses)[-1, :2] / start_sigma_m(self._config)
+        return float(self._weights @ costs + 0.5 * away @ away)
+
+    def rival_m(self, solution: Solution) -> float | None:
+        """How far from the best another optimum lies that fits nearly as well; None where there is none."""
+        spread_m = math.sqrt(float(np.linalg.eigvalsh(solution.covariance[:2, :2])[-1]))
+        points = placed(self._window, self.best)
+        bar = self._misfit(self.best, solution.growth) + self._config.min_optimum_lead
+        for state in self._states:
+            away = math.sqrt(float(np.mean(np.sum((placed(self._window, state) - points) ** 2, axis=1))))
+            if away > max(SAME_M, 3.0 * spread_m) and self._misfit(state, solution.growth) < bar:
+                return away
+        return None
 
 
 def _elsewhere(points_m: FloatArray, tree: cKDTree) -> list[Similarity]:

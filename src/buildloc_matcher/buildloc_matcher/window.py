@@ -9,7 +9,7 @@ metres and radians.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.geometry import Similarity, wrap
+from buildloc_matcher.outline_fit import Walls, align
 
 SHORTEST_STEP_M = 1.0
 CAUCHY = 2.385  # 95 % as efficient as least squares where errors are normal
@@ -32,13 +33,20 @@ class Window:
     """K keyframes in the order of time with the N buildings that they saw.
 
     ``steps`` (K-1, 3) is the mapper's pose of each keyframe in the axes of the one before; ``frames`` (N,)
-    the keyframe of an observation, rising, and ``level_m`` (N, 2) its place in the level camera frame.
+    the keyframe of an observation, rising, and ``level_m`` (N, 2) its place in the level camera frame;
+    ``outlines_m`` (N, P, 2) points of its outline there, or None.
     """
 
     stamps_ns: tuple[int, ...]
     steps: FloatArray
     frames: NDArray[np.int64]
     level_m: FloatArray
+    outlines_m: FloatArray | None
+
+    def thinned(self, rows: NDArray[np.int64]) -> Window:
+        """All keyframes with some of the observations, and half of the points of their outlines."""
+        outlines = None if self.outlines_m is None else self.outlines_m[rows, ::2]
+        return replace(self, frames=self.frames[rows], level_m=self.level_m[rows], outlines_m=outlines)
 
 
 @dataclass(frozen=True)
@@ -56,10 +64,17 @@ class State:
 
 @dataclass(frozen=True)
 class Pairs:
-    """``rows`` (P,) of the window's observations and ``buildings`` (P,) of the reference."""
+    """``rows`` (P,) of the window's observations, ``buildings`` (P,) of the reference that they are, where in
+    the world the observations should lie (P, 2), and how well each pair tells that in any direction, (P, 2,
+    2) from zero to the identity. ``covered`` (P,) is the share of an observation that the reference explains,
+    ``seen`` how many of its buildings are among them."""
 
     rows: NDArray[np.int64]
     buildings: NDArray[np.int64]
+    targets_m: FloatArray
+    certainty: FloatArray
+    covered: FloatArray
+    seen: int
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -79,13 +94,17 @@ class Solution:
 
 def make_window(keyframes: Sequence[Keyframe], observations: Sequence[FrameObservation]) -> Window:
     """The window of keyframes, sorted by time and at least one; observations of other frames are left out."""
-    of_frame = {o.stamp_ns: o.centroids_m for o in observations}
-    seen = [of_frame.get(k.stamp_ns, np.empty((0, 2))) for k in keyframes]
+    of_frame = {o.stamp_ns: o for o in observations if len(o.centroids_m)}
+    found = [of_frame.get(k.stamp_ns) for k in keyframes]
+    seen = [np.empty((0, 2)) if one is None else one.centroids_m for one in found]
+    outlines = [one.outlines_m for one in found if one is not None]
+    known = [one for one in outlines if one is not None]
     poses = np.array([[k.x_m, k.y_m, k.yaw_rad] for k in keyframes])
     moves = np.diff(poses, axis=0)
     steps = np.column_stack([_turned(moves[:, :2], -poses[:-1, 2]), moves[:, 2]])
     frames = np.repeat(np.arange(len(keyframes)), [len(one) for one in seen])
-    return Window(tuple(k.stamp_ns for k in keyframes), steps, frames, np.concatenate(seen))
+    around = np.concatenate(known) if known and len(known) == len(outlines) else None
+    return Window(tuple(k.stamp_ns for k in keyframes), steps, frames, np.concatenate(seen), around)
 
 
 def start(coarse: Similarity, keyframes: Sequence[Keyframe]) -> State:
@@ -95,26 +114,52 @@ def start(coarse: Similarity, keyframes: Sequence[Keyframe]) -> State:
     return State(placed, np.array([0.0, math.log(coarse.scale)]))
 
 
+def start_sigma_m(config: MatcherConfig) -> float:
+    """Error of the start, per axis: its buildings are sought within three of them."""
+    return config.refine_distance_m / 3.0
+
+
 def placed(window: Window, state: State) -> FloatArray:
     """(N, 2) observed buildings in the world."""
     poses = state.poses[window.frames]
     return poses[:, :2] + math.exp(state.log_scales[0]) * _turned(window.level_m, poses[:, 2])
 
 
-def associate(window: Window, points_m: FloatArray, reference: cKDTree, distance_m: float) -> Pairs:
+Pairing = Callable[[Window, State], Pairs]
+
+
+def associate(window: Window, state: State, reference: cKDTree, distance_m: float) -> Pairs:
     """Nearest neighbours closer than the distance; of several of one frame the nearest has the building."""
-    distance, nearest = reference.query(points_m, distance_upper_bound=distance_m)
+    distance, nearest = reference.query(placed(window, state), distance_upper_bound=distance_m)
     rows = np.flatnonzero(np.isfinite(distance))
     rows = rows[np.argsort(distance[rows], kind="stable")]
     _, first = np.unique(window.frames[rows] * reference.n + nearest[rows], return_index=True)
     rows = np.sort(rows[first])
-    return Pairs(rows, nearest[rows])
+    buildings = nearest[rows]
+    whole = np.broadcast_to(np.eye(2), (len(rows), 2, 2))
+    seen = len(np.unique(buildings))
+    return Pairs(rows, buildings, reference.data[buildings], whole, np.ones(len(rows)), seen)
 
 
-def solve(
-    window: Window, state: State, reference: cKDTree, distance_m: float, config: MatcherConfig
-) -> Solution | None:
-    """Gauss-Newton with robust weights, matched anew in every round; None for fewer than three pairs.
+def associate_outlines(window: Window, state: State, reference: Walls) -> Pairs:
+    """The observations whose outlines lie on walls, each with the shift onto them."""
+    assert window.outlines_m is not None
+    poses, scale, count = state.poses[window.frames], math.exp(state.log_scales[0]), len(window.level_m)
+    around = _turned(window.outlines_m.reshape(-1, 2), np.repeat(poses[:, 2], window.outlines_m.shape[1]))
+    found = align(poses[:, None, :2] + scale * around.reshape(count, -1, 2), reference)
+    rows = np.flatnonzero(found.buildings >= 0)
+    targets = placed(window, state)[rows] + found.shifts_m[rows]
+    certainty, covered, seen = found.certainty[rows], found.covered[rows], int(found.seen.sum())
+    return Pairs(rows, found.buildings[rows], targets, certainty, covered, seen)
+
+
+def cauchy(squared: FloatArray | float) -> FloatArray:
+    """Robust cost, nats, of squared errors over their variance: half of them where they are small."""
+    return np.asarray(0.5 * CAUCHY**2 * np.log1p(np.asarray(squared) / CAUCHY**2), dtype=np.float64)
+
+
+def solve(window: Window, state: State, pairing: Pairing, config: MatcherConfig) -> Solution | None:
+    """Gauss-Newton with robust weights, paired anew in every round; None for fewer than three pairs.
 
     An observation of a building that is seen n times has the variance sigma_frame^2 + n sigma_building^2, so
     that all n together weigh what one of them without its own noise does. Errors that turn out larger than
@@ -122,20 +167,20 @@ def solve(
     """
     first, growth = state, 1.0
     for _ in range(ROUNDS):
-        pairs = associate(window, placed(window, state), reference, distance_m)
+        pairs = pairing(window, state)
         if len(pairs) < 3:
             return None
-        fit = _Fit(window, state, first, pairs, reference.data[pairs.buildings], growth, config)
+        fit = _Fit(window, state, first, pairs, growth, config)
         growth = fit.grown()
         step = np.linalg.solve(fit.information(fit.weights), fit.gradient()).astype(np.float64)
         state = State(state.poses + step[:-2].reshape(-1, 3), state.log_scales + step[-2:])
         moved = np.abs(step[:-2].reshape(-1, 3)).max(axis=0)
         if moved[:2].max() < CONVERGED_M and moved[2] < CONVERGED_RAD:
             break
-    pairs = associate(window, placed(window, state), reference, distance_m)
+    pairs = pairing(window, state)
     if len(pairs) < 3:
         return None
-    fit = _Fit(window, state, first, pairs, reference.data[pairs.buildings], growth, config)
+    fit = _Fit(window, state, first, pairs, growth, config)
     covariance, inflation = fit.covariance()
     return Solution(state, covariance, pairs, fit.residuals_m, growth * math.sqrt(inflation))
 
@@ -144,14 +189,14 @@ class _Fit:
     """One linearisation: residuals, robust weights and the normal equations over 3 K + 2 unknowns."""
 
     def __init__(
-        self, window: Window, state: State, first: State, pairs: Pairs, reference_m: FloatArray,
-        growth: float, config: MatcherConfig,
-    ) -> None:  # fmt: skip
+        self, window: Window, state: State, first: State, pairs: Pairs, growth: float, config: MatcherConfig
+    ) -> None:
         self._state, self._first, self._config = state, first, config
         frames = window.frames[pairs.rows]
         turned = _turned(window.level_m[pairs.rows], state.poses[frames, 2])
         self._arms = math.exp(state.log_scales[0]) * turned
-        self.residuals_m = reference_m - state.poses[frames, :2] - self._arms
+        self.residuals_m = pairs.targets_m - state.poses[frames, :2] - self._arms
+        self._certainty = pairs.certainty
         _, self._building, seen = np.unique(pairs.buildings, return_inverse=True, return_counts=True)
         self._seen = seen.astype(np.float64)
         own, shared = config.sigma_frame_m**2, config.sigma_building_m**2
@@ -159,7 +204,8 @@ class _Fit:
         self._mean_variance = shared + own / self._seen
         self.variances = growth**2 * (own + self._seen[self._building] * shared)
         scale2 = growth**2 * (own + shared)
-        self.weights = 1.0 / (1.0 + np.sum(self.residuals_m**2, axis=1) / (CAUCHY**2 * scale2))
+        told = np.einsum("pi,pij,pj->p", self.residuals_m, pairs.certainty, self.residuals_m)
+        self.weights = 1.0 / (1.0 + told / (CAUCHY**2 * scale2))
         self._of_frame = (frames == np.arange(len(state.poses))[:, None]).astype(np.float64)
         self._steps, self._step_jacobian, self._step_information = self._walk(window)
 
@@ -187,7 +233,8 @@ class _Fit:
 
     def _unlikely(self) -> FloatArray:
         """(B,) squared mean residual of each building over its variance per axis, before any growth."""
-        squared = self._means(self.residuals_m[:, 0]) ** 2 + self._means(self.residuals_m[:, 1]) ** 2
+        told = np.einsum("pij,pj->pi", self._certainty, self.residuals_m)
+        squared = self._means(told[:, 0]) ** 2 + self._means(told[:, 1]) ** 2
         return np.asarray(squared / self._mean_variance)
 
     def grown(self) -> float:
@@ -200,7 +247,8 @@ class _Fit:
         jacobian = np.zeros((len(x), 2, 4))
         jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
         jacobian[:, :, 2], jacobian[:, :, 3] = np.column_stack([-y, x]), self._arms
-        blocks = np.einsum("pij,pik->pjk", jacobian * (weights / self.variances)[:, None, None], jacobian)
+        weighted = (weights / self.variances)[:, None, None] * self._certainty @ jacobian
+        blocks = np.einsum("pij,pik->pjk", jacobian, weighted)
         count = len(self._of_frame)
         blocks = (self._of_frame @ blocks.reshape(-1, 16)).reshape(count, 4, 4)
         information = np.zeros((3 * count + 2, 3 * count + 2))
@@ -211,9 +259,9 @@ class _Fit:
         return information
 
     def _prior(self) -> FloatArray:
-        """(3 K + 2,) information of the start, which is weak, about the last pose and both scales."""
+        """(3 K + 2,) information of the start, which is weak, about the last pose, and of both scales."""
         information = np.zeros(3 * len(self._of_frame) + 2)
-        place, turn = self._config.refine_distance_m, math.radians(self._config.rotation_tolerance_deg)
+        place, turn = start_sigma_m(self._config), math.radians(self._config.rotation_tolerance_deg)
         information[-5:] = 1.0 / np.square([place, place, turn, *2 * [self._config.sigma_scale]])
         return information
 
@@ -224,7 +272,7 @@ class _Fit:
 
     def gradient(self) -> FloatArray:
         """(3 K + 2,) by which the normal equations give the step."""
-        pulls = self.residuals_m * (self.weights / self.variances)[:, None]
+        pulls = np.einsum("p,pij,pj->pi", self.weights / self.variances, self._certainty, self.residuals_m)
         turns = self._arms[:, 0] * pulls[:, 1] - self._arms[:, 1] * pulls[:, 0]
         per_frame = self._of_frame @ np.column_stack([pulls, turns])
         gradient = np.concatenate([per_frame.ravel(), [np.sum(self._arms * pulls), 0.0]])
@@ -242,7 +290,8 @@ class _Fit:
         rest = self.information(np.zeros_like(self.weights))
         weights2 = self._means(self.weights) ** 2
         taken = float(np.trace(np.linalg.solve(observed + rest, observed)))
-        curvature = 2.0 * float(weights2.sum())
+        told = self._means(np.trace(self._certainty, axis1=1, axis2=2))
+        curvature = float(np.sum(weights2 * told))
         influence = float(np.sum(weights2 * self._unlikely())) / self._growth**2
         inflation = max(1.0 / self._growth**2, influence / max(curvature - taken, 0.2 * curvature))
         covariance = np.linalg.inv(observed / inflation + rest)[-5:-2, -5:-2]

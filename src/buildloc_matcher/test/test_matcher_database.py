@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import signal
 import subprocess
 import sys
@@ -16,9 +17,10 @@ import geopandas as gpd
 import numpy as np
 import pyarrow as pa
 import pytest
+import shapely
 from buildloc_matcher.matcher import Matcher
 from buildloc_matcher.reference import database as module
-from buildloc_matcher.reference.buildings import Buildings, SourceRecord
+from buildloc_matcher.reference.buildings import OUTLINE_UNIT_M, Buildings, SourceRecord, stored_outlines
 from buildloc_matcher.reference.database import (
     MANIFEST,
     DatabaseError,
@@ -69,6 +71,7 @@ def same(one: ReferenceDatabase, other: ReferenceDatabase) -> bool:
             for t in database.tiles
             for array in (
                 t.box_m, t.owned, t.buildings.centroids_m, t.buildings.areas_m2, t.buildings.shapes,
+                t.buildings.outlines,
                 t.triangles.vertices, t.triangles.neighbours, t.triangles.features, t.triangles.stars,
                 t.sketches,
             )
@@ -113,6 +116,32 @@ def test_one_house_two_houses_and_houses_in_a_row(tmp_path: Path) -> None:
         assert (len(read), read.stars) == (count, 0)
         assert Matcher(read, DEFAULT).locate(local_map(CITY)).candidates == ()
         assert dict(describe_database(path, DEFAULT))["stars"] == "0"
+
+
+def test_outlines_come_back_and_may_be_absent(tmp_path: Path) -> None:
+    places = ORIGIN_M + np.column_stack([np.arange(6.0) * 40.0, np.arange(6.0) ** 2 * 10.0])
+    boxes = np.array([shapely.box(x, y, x + 12.0, y + 9.0) for x, y in places], dtype=object)
+    middles = shapely.get_coordinates(shapely.centroid(boxes))
+    outlined = replace(buildings_at(middles, 1), outlines=stored_outlines(boxes, middles))
+    read = open_database(write(tmp_path / "a.bldb", outlined), DEFAULT)
+    assert read.ground.outlines is not None
+    corners = read.centroids_m[:, None] + OUTLINE_UNIT_M * read.ground.outlines[:, :4]
+    # Units of 0.1 m: half of one off at most.
+    assert np.abs(corners.min(axis=1) - (read.centroids_m - (6.0, 4.5))).max() <= 0.051
+    assert np.abs(corners.max(axis=1) - (read.centroids_m - (-6.0, -4.5))).max() <= 0.051
+    bare = open_database(write(tmp_path / "b.bldb", buildings_at(middles, 1)), DEFAULT)
+    assert bare.ground.outlines is None
+
+
+def test_outlines_are_simplified_until_they_fit() -> None:
+    polygons = np.array([shapely.Point(1e5, 2e5).buffer(30.0, 64), shapely.box(0, 0, 9000, 9)], dtype=object)
+    disc, too_wide = stored_outlines(polygons, shapely.get_coordinates(shapely.centroid(polygons)))
+    x, y = OUTLINE_UNIT_M * disc.T.astype(float)
+    # A polygon of eight corners has 90 % of its circle's area.
+    area = 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
+    assert 0.89 * math.pi * 30.0**2 < area < math.pi * 30.0**2  # counter-clockwise
+    assert not too_wide.any()
+    assert stored_outlines(np.empty(0, dtype=object), np.empty((0, 2))).shape == (0, 12, 2)
 
 
 def test_the_features_are_mapped_and_not_read(city: Path) -> None:
@@ -225,8 +254,8 @@ MANIFESTS: dict[str, tuple[Damage, str]] = {
     "no object": (lambda m: "buildloc-reference", "is damaged or of another program"),
     "without version": (lambda m: m.pop("version") and m, "is damaged or of another program"),
     "other format": (lambda m: m | {"format": "mbtiles"}, "is not a buildloc reference database"),
-    "older": (lambda m: m | {"version": 1}, "has version 1, not 2"),
-    "newer": (lambda m: m | {"version": 3}, "has version 3, not 2"),
+    "older": (lambda m: m | {"version": 1}, "has version 1, not 3"),
+    "newer": (lambda m: m | {"version": 4}, "has version 4, not 3"),
     "other descriptor": (lambda m: m | {"descriptor_hash": "0" * 16}, "another descriptor configuration"),
     "without descriptor": (lambda m: m.pop("descriptor_hash") and m, "another descriptor configuration"),
     "without tiles": (lambda m: m.pop("tiles") and m, "is damaged"),
@@ -465,7 +494,7 @@ def test_it_describes_itself(city: Path) -> None:
     rows = describe_database(city, DEFAULT)
     told = dict(rows)
     west, south, east, north = whole(CITY).bounds_m
-    assert told["format"] == "buildloc-reference 2" and told["CRS"] == f"EPSG:{UTM}"
+    assert told["format"] == "buildloc-reference 3" and told["CRS"] == f"EPSG:{UTM}"
     assert told["bounds"].startswith(f"{west:.0f} {south:.0f} {east:.0f} {north:.0f} m")
     assert (told["buildings"], told["tiles"]) == ("900", str(len(tiled(CITY, 800.0).tiles)))
     assert told["stars"] == f"{whole(CITY).stars:,}" and "checksums agree" in told["size"]

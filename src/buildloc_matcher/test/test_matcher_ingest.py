@@ -90,7 +90,7 @@ def around(x: float, y: float, radius_km: float) -> Circle:
 def same(one: Reference, other: Reference) -> bool:
     return all(
         np.array_equal(getattr(one.buildings, name), getattr(other.buildings, name))
-        for name in ("centroids_m", "areas_m2", "shapes")
+        for name in ("centroids_m", "areas_m2", "shapes", "outlines")
     )
 
 

@@ -20,6 +20,7 @@ from buildloc_msgs_py.types import ByteArray, CameraModel, FloatArray, Frame, Fr
 from buildloc_msgs_py.wire import WireError
 
 Quaternion = tuple[float, float, float, float]
+OUTLINE_POINTS = 24
 UNDISTORT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-10)  # ends well below a pixel
 
 
@@ -195,11 +196,26 @@ def observe(
     attitude_xyzw: Quaternion,
     min_area_m2: float,
 ) -> FrameObservation:
-    """Centroids of the buildings of one frame that do not touch the image's border."""
+    """Centroids and outlines of the buildings of one frame that do not touch the image's border."""
     height, width = mask_pixels.shape
     gsd = altitude_m / camera.fx
-    _, _, stats, centroids = cv2.connectedComponentsWithStats(mask_pixels, connectivity=8)
+    _, labels, stats, centroids = cv2.connectedComponentsWithStats(mask_pixels, connectivity=8)
     x, y, w, h, area = stats[1:].T
     inside = (x > 0) & (y > 0) & (x + w < width) & (y + h < height) & (area * gsd * gsd >= min_area_m2)
-    uv = np.asarray(centroids[1:][inside], dtype=np.float64)
-    return FrameObservation(stamp_ns, pixels_to_level(uv, camera, altitude_m, attitude_xyzw), altitude_m)
+    rings = _rings(mask_pixels, np.asarray(labels, dtype=np.int32))[1:][inside]
+    uv = np.concatenate([centroids[1:][inside], rings.reshape(-1, 2)])
+    level = pixels_to_level(uv, camera, altitude_m, attitude_xyzw)
+    around = level[len(rings) :].reshape(rings.shape)
+    return FrameObservation(stamp_ns, level[: len(rings)], altitude_m, around)
+
+
+def _rings(mask_pixels: ByteArray, labels: NDArray[np.int32]) -> FloatArray:
+    """(labels, OUTLINE_POINTS, 2) pixels along the outer border of every component, counter-clockwise when v
+    points up. They lie half a pixel inside, all around."""
+    contours, tree = cv2.findContours(mask_pixels, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    rings = np.zeros((int(labels.max()) + 1, OUTLINE_POINTS, 2))
+    for contour, (_, _, _, parent) in zip(contours, tree[0] if contours else (), strict=True):
+        if parent < 0:  # not the border of a courtyard
+            u, v = contour[0, 0]
+            rings[labels[v, u]] = contour[np.arange(OUTLINE_POINTS) * len(contour) // OUTLINE_POINTS, 0]
+    return rings

@@ -136,11 +136,13 @@ class LocalMap:
 @dataclass(frozen=True)
 class FrameObservation:
     """Building centroids of one frame, (N, 2) metres in the level camera frame (x image right, y up,
-    origin below the camera)."""
+    origin below the camera); ``outlines_m`` (N, P, 2), if known, are P points evenly along each outline,
+    counter-clockwise."""
 
     stamp_ns: int
     centroids_m: FloatArray
     altitude_m: float
+    outlines_m: FloatArray | None = None
 
 
 @dataclass(frozen=True)

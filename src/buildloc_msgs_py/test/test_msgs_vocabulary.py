@@ -134,6 +134,27 @@ def test_observe_leaves_out_what_touches_the_border() -> None:
     assert (seen.stamp_ns, seen.altitude_m) == (5, 100.0)
 
 
+def test_observe_follows_outlines_counter_clockwise() -> None:
+    mask = np.zeros((48, 64), dtype=np.uint8)
+    mask[10:40, 10:50] = 255
+    mask[15:35, 15:45] = 0  # a courtyard
+    mask[20:30, 25:35] = 255  # and a house in it
+    seen = ground.observe(mask, 5, CAMERA, 100.0, LEVEL, 20.0)
+    assert seen.outlines_m is not None and seen.outlines_m.shape == (2, ground.OUTLINE_POINTS, 2)
+    pixel = 100.0 / CAMERA.fx
+    sides = np.array([[39.0, 29.0], [9.0, 9.0]]) * pixel  # between the centres of the outermost pixels
+    for ring, centre, side in zip(seen.outlines_m, seen.centroids_m, sides, strict=True):
+        assert np.abs(ring - centre).max(axis=0) == pytest.approx(side / 2.0, abs=pixel)
+        x, y = ring.T
+        assert 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) == pytest.approx(side.prod(), rel=0.1)
+
+
+def test_a_frame_without_buildings_has_no_outlines() -> None:
+    seen = ground.observe(np.zeros((48, 64), np.uint8), 5, CAMERA, 100.0, LEVEL, 20.0)
+    assert seen.centroids_m.shape == (0, 2)
+    assert seen.outlines_m is not None and seen.outlines_m.shape == (0, ground.OUTLINE_POINTS, 2)
+
+
 @dataclass(frozen=True)
 class SampleConfig:
     """A config of every kind of parameter."""

@@ -15,8 +15,7 @@ FLIGHT = "flight"  # over ground that the reference holds as it is: four of five
 CONTROLS = (
     "outside", "another city", "mirrored", "missing", "shifted", "grid suburbs", "snow", "scaled",
 )  # fmt: skip
-CONTROL_EVERY = 5
-PAPER_EVERY = 11  # not a multiple of CONTROL_EVERY: every kind has its share
+PAPER_EVERY = 11  # not a multiple of how often controls come: every kind has its share
 CHUNK = 100  # trials with consecutive numbers are of one region
 
 BUILDINGS = (20, 40, 60, 100, 200)
@@ -60,7 +59,8 @@ class Territory:
 class Place:
     """A region to be searched: around ``centre_deg`` (latitude, longitude), at one of the radii. Flights are
     over the footprints of ``world``, the reference is of ``reference``; ``outside_km`` is the radius of the
-    reference that flights outside of it are tried against."""
+    reference that flights outside of it are tried against. ``registration_m``: standard deviation per axis of
+    what the one lies beside the other as a whole, as far as a map reaches."""
 
     name: str
     city: str
@@ -69,6 +69,7 @@ class Place:
     centre_deg: tuple[float, float]
     radii_km: tuple[float, ...]
     outside_km: float
+    registration_m: float = 0.0
 
     @property
     def slug(self) -> str:
@@ -78,9 +79,11 @@ class Place:
 
 @dataclass(frozen=True)
 class Plan:
-    """A set of places with the territory of every source, ground that no other set touches."""
+    """A set of places with the territory of every source, ground that no other set touches; every
+    ``control_every``-th trial is a negative control."""
 
     name: str
+    control_every: int
     places: tuple[Place, ...]
     territories: dict[str, Territory]
 
@@ -95,6 +98,7 @@ ALL_BOSTON = Box(-72.0, 42.0, -70.5, 43.0)
 # The box of Tokyo is halved along a meridian, with 370 m between the halves.
 TOKYO_WEST, TOKYO_EAST = Box(139.66, 35.58, 139.703, 35.66), Box(139.707, 35.58, 139.75, 35.66)
 TOKYO_KM = (3.0, 5.0)  # the larger holds all of a half
+TOKYO_REGISTRATION_M = 0.33  # mean offsets of the same buildings in cells of 300 m: RMS per axis
 
 
 def _boston(name: str, centre_deg: tuple[float, float]) -> Place:
@@ -103,17 +107,19 @@ def _boston(name: str, centre_deg: tuple[float, float]) -> Place:
 
 def _tokyo(side: str, half: Box) -> tuple[Place, ...]:
     centre = ((half.south_deg + half.north_deg) / 2.0, (half.west_deg + half.east_deg) / 2.0)
+    sources = (("PLATEAU over OSM", PLATEAU, OSM), ("OSM over PLATEAU", OSM, PLATEAU))
     return tuple(
-        Place(f"Tokyo {side}, {title}", "Tokyo", world, reference, centre, TOKYO_KM, TOKYO_KM[0])
-        for title, world, reference in (
-            ("PLATEAU over OSM", PLATEAU, OSM),
-            ("OSM over PLATEAU", OSM, PLATEAU),
+        Place(
+            f"Tokyo {side}, {title}", "Tokyo", world, reference, centre, TOKYO_KM, TOKYO_KM[0],
+            TOKYO_REGISTRATION_M,
         )
-    )
+        for title, world, reference in sources
+    )  # fmt: skip
 
 
 CALIBRATION = Plan(
     "calibration",
+    1,  # what acceptance is calibrated on are wrong candidates
     (_boston("Framingham", FRAMINGHAM), *_tokyo("west", TOKYO_WEST)),
     {
         BOSTON: Territory((ALL_BOSTON,), tuple(Circle(*centre, BOSTON_KM[-1] + GAP_KM) for centre in TESTED)),
@@ -123,6 +129,7 @@ CALIBRATION = Plan(
 )
 TEST = Plan(
     "test",
+    5,
     (
         _boston("Lexington", LEXINGTON),
         _boston("Burlington", BURLINGTON),
@@ -190,8 +197,8 @@ def trial(plan: Plan, seed: int, number: int) -> Trial:
     level = int(rng.choice(LEVELS, p=LEVEL_SHARES))
     shift = float(rng.choice(SHIFTS_M))
     kind, detail, variant, amount, town = FLIGHT, "", AS_IS, 0.0, TOWN_NONE
-    if number % CONTROL_EVERY == CONTROL_EVERY - 1:
-        kind = CONTROLS[number // CONTROL_EVERY % len(CONTROLS)]
+    if number % plan.control_every == plan.control_every - 1:
+        kind = CONTROLS[number // plan.control_every % len(CONTROLS)]
         side = int(rng.integers(2))
         if kind == "outside":
             radius = place.outside_km

@@ -16,7 +16,7 @@ from buildloc_msgs_py.types import Fix, FloatArray, LocalMap, NoFix
 
 from buildloc_eval.integrity.grounds import Grounds
 from buildloc_eval.integrity.plan import TOWN_NONE, Place, Plan, Trial, shift_of, streams, trial
-from buildloc_eval.observation import Digitiser, sensing
+from buildloc_eval.observation import Digitiser, sensing, true_place
 from buildloc_eval.observed_flight import Flown, ObservedFlight, mirrored, observe_flight, scaled
 
 Record = dict[str, Any]
@@ -26,11 +26,21 @@ NOTHING = Digitiser(0.0, 0.0, 1e-9, 0.0, 0.0, (0.0, 0.0, 0.0, 0.0))
 
 @dataclass(frozen=True)
 class Attempt:
-    """A flight against a reference; the truth (2,) m, moved by the reference's shift."""
+    """A flight against a reference that is shifted by (2,) m against the ground flown over."""
 
     flight: ObservedFlight
     database: ReferenceDatabase
-    truth_m: FloatArray
+    shift_m: FloatArray
+
+    @property
+    def camera_m(self) -> FloatArray:
+        """(2,) true place of the camera at the last keyframe, as the reference would have it."""
+        return self.flight.camera_m + self.shift_m
+
+    def true_place(self, at_m: FloatArray) -> FloatArray:
+        """The same of a place of the map."""
+        mapped = self.flight.local_map.centroids_m
+        return true_place(mapped, self.flight.true_m, at_m) + self.shift_m
 
 
 class RecordingMatcher(Matcher):
@@ -65,7 +75,7 @@ def attempt(one: Trial, grounds: Grounds) -> Attempt:
     elif one.kind == "scaled":
         flight = scaled(flight, one.amount)
     reference = grounds.reference(one.place, one.radius_km, one.variant)
-    return Attempt(flight, reference, flight.camera_m + shift_of(one, rng))
+    return Attempt(flight, reference, shift_of(one, rng))
 
 
 def _ground(one: Trial, grounds: Grounds) -> tuple[Flown, Place]:
@@ -81,8 +91,8 @@ def _ground(one: Trial, grounds: Grounds) -> tuple[Flown, Place]:
 
 
 def config_of(one: Trial) -> MatcherConfig:
-    """The default preset."""
-    return matcher_config()
+    """The default preset, which knows how well the reference is registered."""
+    return matcher_config({"sigma_registration_m": math.hypot(one.shift_m, one.place.registration_m)})
 
 
 def run(number: int, grounds: Grounds) -> Record:
@@ -98,8 +108,10 @@ def run(number: int, grounds: Grounds) -> Record:
     record |= {"observe_s": flown - started, "seconds": answered - flown}
     record["cpu_s"] = time.process_time() - worked
     record |= _judged(matcher.judge(matcher.found), answer.result)
+    errors = _errors(one, matcher.found, tried)
     record |= _candidates(matcher.found)
-    record["best_error_m"] = _best_error(one, matcher, matcher.found, tried)
+    record |= {"candidate_error_m": errors, "best_error_m": errors[0] if errors else math.nan}
+    record["search_camera_error_m"] = _camera_error(one, matcher, matcher.found, tried)
     record |= {f"funnel.{name}": value for name, value in answer.funnel.items()}
     record |= _fix(one, answer.result, tried)
     if one.paper:
@@ -143,16 +155,22 @@ def _candidates(found: MatchResult) -> Record:
     }
 
 
-def _best_error(one: Trial, matcher: Matcher, found: MatchResult, tried: Attempt) -> float:
-    """Where the best candidate puts the last camera, against the truth, m; NaN without a candidate, infinite
-    where no place is right."""
-    if not found.candidates:
-        return math.nan
-    if one.absent:
-        return math.inf
+def _errors(one: Trial, found: MatchResult, tried: Attempt) -> list[float]:
+    """How far from the truth each candidate puts the map's middle, m; infinite where no place is right."""
+    if one.absent or found.query is None:
+        return [math.inf] * len(found.candidates)
+    middle = tried.true_place(found.query.points_m.mean(axis=0))
+    return [math.hypot(c.x_m - middle[0], c.y_m - middle[1]) for c in found.candidates]
+
+
+def _camera_error(one: Trial, matcher: Matcher, found: MatchResult, tried: Attempt) -> float:
+    """The same of the best candidate and the last camera, which lies at the end of the map, where it may have
+    no matches; NaN without a candidate."""
+    if one.absent or not found.candidates:
+        return math.inf if found.candidates else math.nan
     last = tried.flight.keyframes[-1]
-    place = matcher.place(found, np.array([last.x_m, last.y_m])).apply(np.array([[last.x_m, last.y_m]]))[0]
-    return math.hypot(*(place - tried.truth_m))
+    at = np.array([last.x_m, last.y_m])
+    return math.hypot(*(matcher.place(found, at).apply(at[None])[0] - tried.camera_m))
 
 
 def _fix(one: Trial, result: Fix | NoFix, tried: Attempt) -> Record:
@@ -161,7 +179,7 @@ def _fix(one: Trial, result: Fix | NoFix, tried: Attempt) -> Record:
         names = ("fix_error_m", "east_error_m", "north_error_m", "var_east_m2", "var_north_m2",
                  "cov_east_north_m2", "nees", "yaw_error_rad")  # fmt: skip
         return dict.fromkeys(names, math.nan)
-    error = np.array([result.easting_m, result.northing_m]) - tried.truth_m
+    error = np.array([result.easting_m, result.northing_m]) - tried.camera_m
     covariance = result.covariance_enu_m2[:2, :2]
     turn = result.yaw_rad - tried.flight.yaw_rad
     return {
@@ -184,9 +202,10 @@ def _paper(one: Trial, tried: Attempt) -> Record:
     started = time.perf_counter()
     matcher = Matcher(tried.database, paper_config())
     found = matcher.locate(tried.flight.local_map)
+    errors = _errors(one, found, tried)
     return {
-        "paper_answers": len(found.candidates) > 0,
-        "paper_jaccard": found.candidates[0].mnn_jaccard if found.candidates else math.nan,
-        "paper_error_m": _best_error(one, matcher, found, tried),
+        "paper_answers": len(errors) > 0,
+        "paper_jaccard": found.candidates[0].mnn_jaccard if errors else math.nan,
+        "paper_error_m": errors[0] if errors else math.nan,
         "paper_s": time.perf_counter() - started,
     }

@@ -1,7 +1,7 @@
 """The reference database: a folder of Arrow tables, opened by memory map, and the manifest that names them.
 
     city.bldb/database.json                     what it is; replaced at once when a build has succeeded
-    city.bldb/TILE.ID.buildings.arrow           geometry (points of the UTM zone), area, shape metrics
+    city.bldb/TILE.ID.buildings.arrow           geometry (points of the UTM zone), area, shape, outline
     city.bldb/TILE.ID.triangles.arrow           vertices, neighbours, features and sketches of triangles
 
 The tables are Arrow IPC files with the metadata of GeoParquet: GeoPandas (read_feather), QGIS and DuckDB
@@ -36,16 +36,17 @@ from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.descriptors import DESCRIPTOR_VERSION, MAX_CIRCUMRADIUS_M, TRIANGLE_FEATURES, Triangles
 from buildloc_matcher.evidence import Ground, ground
 from buildloc_matcher.matching import StarTable, star_table
-from buildloc_matcher.reference.buildings import Buildings, SourceRecord, concatenate
+from buildloc_matcher.reference.buildings import OUTLINE_VERTICES, Buildings, SourceRecord, concatenate
 from buildloc_matcher.reference.tile import Box, Tile, make_tile
 from buildloc_matcher.star_index import SKETCH_BYTES
 
 FORMAT = "buildloc-reference"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 MANIFEST = "database.json"
 WGS84 = 4326
 TABLES = ("buildings", "triangles")
 REBUILD = "build it again with `buildloc refdb build`"
+OUTLINE = "outline_dm"
 SKETCH_COLUMNS = tuple(f"sketch_{i:02d}" for i in range(SKETCH_BYTES))
 
 
@@ -81,7 +82,7 @@ class ReferenceDatabase:
     @cached_property
     def ground(self) -> Ground:
         """Finds the buildings near a place."""
-        return ground(self.centroids_m, self.buildings.areas_m2)
+        return ground(self.centroids_m, self.buildings.areas_m2, self.buildings.outlines)
 
     @cached_property
     def tables(self) -> tuple[StarTable, ...]:
@@ -244,6 +245,8 @@ def _buildings_table(tile: Tile, epsg: int) -> pa.Table:
         **{n: pa.array(np.ascontiguousarray(c)) for n, c in zip(SHAPE_METRICS, found.shapes.T, strict=True)},
         "beyond_tile": pa.array(np.arange(len(found)) >= tile.owned),
     }
+    if found.outlines is not None:
+        columns[OUTLINE] = _fixed(found.outlines.reshape(len(found), -1))
     geometry = {"encoding": "point", "geometry_types": ["Point"], "crs": CRS(epsg).to_json_dict()}
     geo = {"version": "1.1.0", "primary_column": "geometry", "columns": {"geometry": geometry}}
     extension = {"ARROW:extension:name": "geoarrow.point"}
@@ -339,6 +342,9 @@ def _open_tile(path: Path, entry: Mapping[str, Any]) -> Tile:
         np.column_stack([np.asarray(point.field("x")), np.asarray(point.field("y"))]),
         np.asarray(_column(found, "area_m2")),
         np.column_stack([np.asarray(_column(found, name)) for name in SHAPE_METRICS]),
+        _rows(found, OUTLINE, 2 * OUTLINE_VERTICES).reshape(-1, OUTLINE_VERTICES, 2)
+        if OUTLINE in found.column_names
+        else None,
     )
     stars, owned = int(entry["stars"]), int(entry["owned"])
     triangles = Triangles(

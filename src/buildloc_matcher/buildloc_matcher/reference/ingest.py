@@ -15,7 +15,7 @@ from buildloc_msgs_py.footprint import footprints
 from buildloc_msgs_py.types import FloatArray
 from pyproj import CRS, Transformer
 
-from buildloc_matcher.reference.buildings import Buildings, SourceRecord, concatenate
+from buildloc_matcher.reference.buildings import Buildings, SourceRecord, concatenate, stored_outlines
 from buildloc_matcher.reference.merge import overlapping_ids, windows
 from buildloc_matcher.reference.readers import (
     FootprintFile,
@@ -203,6 +203,7 @@ class _Measure:
         rows = np.zeros(len(outlines), ROW)
         rows["x"], rows["y"] = found.centroids_m.T
         rows["area"], rows["shape"] = found.areas_m2, found.shapes
+        rows["outline"] = stored_outlines(outlines, found.centroids_m)
         rows["source"] = self.source.rank
         return rows, outlines, counts
 

@@ -11,12 +11,17 @@ import shapely
 from buildloc_msgs_py.types import FloatArray
 from numpy.typing import NDArray
 
-from buildloc_matcher.reference.buildings import Buildings
+from buildloc_matcher.reference.buildings import OUTLINE_VERTICES, Buildings
 from buildloc_matcher.reference.readers import Geometries
 from buildloc_matcher.reference.region import Bounds
 
 # One building; ``source`` is its place on the command line, ``id`` unlike any other in the spool.
-ROW = np.dtype([("x", "f8"), ("y", "f8"), ("area", "f4"), ("shape", "f4", 4), ("source", "u2"), ("id", "i8")])
+ROW = np.dtype(
+    [
+        ("x", "f8"), ("y", "f8"), ("area", "f4"), ("shape", "f4", 4), ("source", "u2"), ("id", "i8"),
+        ("outline", "i2", (OUTLINE_VERTICES, 2)),
+    ]
+)  # fmt: skip
 CELL_M = 5_000.0  # side of the squares that outlines are compared in: a city's worth fits in memory
 OUTLINE = pa.schema([("source", pa.uint16()), ("id", pa.int64()), ("wkb", pa.binary())])
 
@@ -49,7 +54,7 @@ def buildings_of(rows: Rows) -> Buildings:
     """The columns of the rows."""
     return Buildings(
         np.column_stack([rows["x"], rows["y"]]), np.ascontiguousarray(rows["area"]),
-        np.ascontiguousarray(rows["shape"]),
+        np.ascontiguousarray(rows["shape"]), np.ascontiguousarray(rows["outline"]),
     )  # fmt: skip
 
 
