@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,15 +15,18 @@ from browser import open_page
 from buildloc_eval.beyond import evaluate
 from buildloc_eval.beyond.cases import EVERYWHERE, FACTORS, PRESETS, Case, Reference, ablated
 from buildloc_eval.beyond.evaluate import FULL, Plan, cases, draw, spoilt, within
+from buildloc_eval.beyond.report import failure_table, row
 from buildloc_eval.paper.sources import measure
 from buildloc_eval.paper.store import StaleError
 from buildloc_eval.realworld import LEXINGTON_DEG
 from buildloc_eval.town import suburb
+from buildloc_eval.trials import Trial
 from buildloc_eval.world import to_utm
 from buildloc_matcher.reference.buildings import Buildings
 from scipy.spatial import cKDTree
 
 CENTRE = np.array(to_utm(*LEXINGTON_DEG)[1:])
+grouped = pytest.mark.xdist_group("eval_beyond")
 SHORT = Plan(3, 5, (FACTORS[0], FACTORS[3]))
 
 
@@ -85,12 +89,20 @@ def test_the_reference_is_spoilt_as_asked(buildings: Buildings) -> None:
     assert len(within(buildings, 0.5)) < count == len(within(buildings, None))
 
 
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, str, list[str]]]:
+    """The folder of a short run, its summary and what it said."""
+    out, said = tmp_path_factory.mktemp("beyond"), list[str]()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluate, "read_boston", outlines)
+        patch.setattr(evaluate, "QUICK", SHORT)
+        yield out, evaluate.evaluate(out, 1, True, said.append), said
+
+
+@grouped
 @pytest.mark.slow
-def test_a_short_run_is_kept_and_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(evaluate, "read_boston", outlines)
-    monkeypatch.setattr(evaluate, "QUICK", SHORT)
-    out, said = tmp_path / "out", list[str]()
-    text = evaluate.evaluate(out, 1, True, said.append)
+def test_a_short_run_is_kept_and_reported(run: tuple[Path, str, list[str]]) -> None:
+    out, text, said = run
     made = {path: path.stat().st_mtime_ns for path in (out / "trials").glob("*.pickle")}
     assert len(made) == len(cases(SHORT)) and "min left" in said[-1]
     report = json.loads((out / "report.json").read_text())
@@ -105,6 +117,24 @@ def test_a_short_run_is_kept_and_reported(tmp_path: Path, monkeypatch: pytest.Mo
     assert again == [] and made == {path: path.stat().st_mtime_ns for path in made}
     with pytest.raises(StaleError, match="another seed"):
         evaluate.evaluate(out, 2, True, again.append)
-    page = open_page(out / "report.html", 1280, tmp_path / "report.png", tmp_path / "profile")
+
+
+@grouped
+def test_the_report_is_whole_in_a_browser(run: tuple[Path, str, list[str]], tmp_path: Path) -> None:
+    page = open_page(run[0] / "report.html", 1280, tmp_path / "report.png", tmp_path / "profile")
     assert page.console == [] and page.wide <= 1280
     assert len(page.images) == 4 and all(image["decoded"] > 100 for image in page.images)
+    assert len(page.tables) >= 6 and all(table["height"] > 15 for table in page.tables)
+
+
+def test_failures_are_told_by_stage_value_and_preset() -> None:
+    factor = FACTORS[3]
+    by_preset = {preset: factor.of(preset)[:2] for preset in PRESETS}
+    right, lost = Trial(1, 2.0, True, {}), Trial(0, 900.0, False, {}, "matching: the true bin had no vote")
+    located = {case: (right, lost) for values in by_preset.values() for _, case in values}
+    located[by_preset["default"][0][1]] = (right, right)
+    rows = failure_table([(factor, by_preset)], located)
+    assert [(row["preset"], row["maps"], row["at"]) for row in rows] == [
+        ("default", 1, "1.0: 1"), ("paper", 2, "0.0: 1, 1.0: 1"),
+    ]  # fmt: skip
+    assert row([right, lost])["lost by"] == ["matching: 1"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,16 @@ from buildloc_eval.paper.flown import Maps, Snapshot
 from buildloc_eval.paper.methods import BRM, STARS, Prediction
 from buildloc_eval.paper.plan import Models, Plan, Stores, maps_name, ragged
 from buildloc_eval.paper.published import FLIGHTS
-from buildloc_eval.paper.report import boston, held, write
+from buildloc_eval.paper.report import (
+    Converged,
+    Trial,
+    boston,
+    convergence_table,
+    failure_table,
+    failures_one_by_one,
+    held,
+    write,
+)
 from buildloc_eval.paper.scoring import (
     Score,
     bins_within,
@@ -25,6 +34,7 @@ from buildloc_eval.paper.scoring import (
     first_and_stable,
     interval,
     lost_by,
+    mean_interval,
     rank_of_bin,
     recall_row,
     score,
@@ -200,6 +210,8 @@ def test_each_failure_names_the_stage_that_lost_it() -> None:
     assert lost_by(found, 2, 1, 6.0).startswith("ranking")
     assert lost_by(found, 0, 2, 6.0).startswith("selection")
     assert lost_by(found, 0, bins_within(6.0), 6.0).startswith("matching")
+    none = prediction([], [])
+    assert lost_by(none, 0, bins_within(6.0), 6.0).startswith("voting")
     assert lost_by(methods.nothing("too few"), 0, bins_within(6.0), 6.0) == "too few"
 
 
@@ -231,6 +243,39 @@ def test_recall_has_an_interval_and_errors_are_of_the_right_ones() -> None:
         "refined": 7,
     }  # fmt: skip
     assert error_row(scores[-1:])["final_median_m"] is None
+
+
+def test_the_interval_of_a_mean_is_students() -> None:
+    assert mean_interval([1.0, 2.0, 3.0]) == [-0.48, 4.48]  # 2 -/+ 4.303 / sqrt(3)
+    assert mean_interval([5.0]) is None
+
+
+def test_convergence_is_over_flights_and_seeds_that_reach_it() -> None:
+    ranks = (9, 1, 1)
+    traces = [
+        Converged("default preset", 6, 1, "flight1", 2, 2, ranks, 2),
+        Converged("default preset", 6, 2, "flight1", 4, 6, ranks, 2),
+        Converged("default preset", 6, 1, "flight2", 3, None, ranks, 2),
+        Converged("default preset", 6, 2, "flight2", None, None, ranks, None),
+    ]
+    (row,) = convergence_table(traces)
+    assert (row["flights"], row["first success"], row["stable success"]) == (4, 3.0, 4.0)
+    assert (row["first success, flights"], row["stable success, flights"]) == (3, 2)
+    assert row["first success_95%"] == mean_interval([2.5, 4.0])
+    assert row["by flight, first"] == "flight1: 3.0 (2 to 4), flight2: 3.0 (3 to 3)"
+    assert row["by flight, stable"] == "flight1: 4.0 (2 to 6), flight2: never"
+
+
+def test_a_failure_is_told_with_its_funnel() -> None:
+    wrong = replace(prediction([[0.0, 0.0]], [[0, 0]]), funnel={"stars": 64.0}, refused="undecided: few")
+    right, lost = Score(1, 3.0, 2.0, 1, True, ""), Score(0, 900.0, math.inf, 9, False, "selection: lost")
+    trials = [Trial("default preset", 6, "flight1", 1, right, wrong),
+              Trial("default preset", 6, "flight1", 2, lost, wrong)]  # fmt: skip
+    (row,) = failures_one_by_one(trials, "default preset")
+    assert (row["flight"], row["seed"], row["rank"], row["rank of the true bin"]) == ("flight1", 2, None, 9)
+    assert (row["lost by"], row["refused"], row["stars"]) == ("selection: lost", "undecided: few", 64.0)
+    (row,) = failure_table(trials)
+    assert (row["trials"], row["where"], row["stars"], row["looks"]) == (1, "flight1 at 6 km: 1", 64.0, None)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from buildloc_matcher.config import MatcherConfig, matcher_config
 from buildloc_eval.observation import Level
 
 PRESETS = ("default", "paper")
-SHAPES = "shape metrics"  # their weight is no parameter: both sides get the same ones instead
+NO_SHAPES = "no shapes"  # their weight is no parameter: all buildings of both sides get the same ones
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Case:
 
     @property
     def cost(self) -> float:
-        """Relative: what is searched is made in a time that its size tells."""
+        """Relative: a large reference takes long to make and to search."""
         return 3.0 if self.reference.radius_km is None else 1.0
 
     @property
@@ -77,7 +77,7 @@ _DESCRIPTOR: Mapping[str, Mapping[str, Any]] = {
     "angles hardly count": {"score_angle_deg": 180.0},
     "perimeters filter nothing": {"tau_perimeter": 0.95},
     "perimeters hardly count": {"score_perimeter": 5.0},
-    "no shapes": {},
+    NO_SHAPES: {},
 }
 ABLATIONS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     "default": {
@@ -162,8 +162,6 @@ ABLATED_LEVELS: tuple[Level, ...] = (1, 2)
 def ablated(preset: str, level: Level) -> list[tuple[str, Case]]:
     """A preset whole and without each part, at a level."""
     whole = Case(preset, level=level)
-    named = {name: replace(whole, ablation=name) for name in ABLATIONS[preset]}
-    same = Reference(shapes=False)
-    return [("whole", whole)] + [
-        (name, replace(case, reference=same) if name == "no shapes" else case) for name, case in named.items()
-    ]
+    without = {name: replace(whole, ablation=name) for name in ABLATIONS[preset]}
+    without[NO_SHAPES] = replace(without[NO_SHAPES], reference=Reference(shapes=False))
+    return [("whole", whole), *without.items()]
