@@ -29,6 +29,7 @@ from buildloc_matcher.local_map import check_map
 from buildloc_matcher.match_cache import MakeStarMatcher, MatchCache, StarMatcher
 from buildloc_matcher.mesh import Mesh, mesh
 from buildloc_matcher.pursuit import Agreement, Place, Pose, sigmas_apart
+from buildloc_matcher.reference.buildings import OUTLINE_UNIT_M
 from buildloc_matcher.reference.database import DatabaseError, ReferenceDatabase, descriptor_hash
 from buildloc_matcher.refinement import Refined, Unrefined, covariance_enu, refine
 from buildloc_matcher.selection import Score, local_transform, select
@@ -117,14 +118,19 @@ class Matcher:
             self._looks.append(_Look(config.second_look, MOST_STARS, star_matcher(database.tables, second)))
 
     def warm_up(self) -> None:
-        """Locate a piece of the reference itself: compiled code is loaded, and on a new machine compiled
-        (a quarter of a minute), before the flight and not in it."""
+        """Locate and refine a piece of the reference itself: compiled code is loaded, and on a new machine
+        compiled (a quarter of a minute), before the flight and not in it."""
         buildings = self.database.buildings
         apart = np.sum((buildings.centroids_m - buildings.centroids_m[0]) ** 2, axis=1)
         some = buildings.select(np.argsort(apart)[:WARM_UP_BUILDINGS])
         ids = np.arange(len(some), dtype=np.int64)
         areas, shapes = some.areas_m2.astype(np.float64), some.shapes.astype(np.float64)
         self.locate(LocalMap.whole(0, ids, some.centroids_m, areas, shapes, np.ones_like(ids)))
+        level = some.centroids_m - buildings.centroids_m[0]
+        outlines = None if some.outlines is None else level[:, None] + OUTLINE_UNIT_M * some.outlines
+        here = Similarity((0.0, 0.0), (buildings.centroids_m[0, 0], buildings.centroids_m[0, 1]), 0.0)
+        seen = FrameObservation(0, level, 100.0, outlines)
+        refine(here, [Keyframe(0, 0.0, 0.0, 0.0)], [seen], self.database.ground, self.config)
 
     def locate(self, local_map: LocalMap) -> MatchResult:
         """Ranked candidates of a map; their x, y is where the mean of the map's buildings lies.

@@ -24,12 +24,17 @@ FULL = 0.3  # share of an outline's points that tells one direction as well as i
 
 @dataclass(frozen=True)
 class Walls:
-    """Buildings of the reference: counter-clockwise vertices (B, V, 2) m, middles (B, 2) of their boxes, and
-    radii (B,) around these; a building without an outline has radius 0."""
+    """Buildings of the reference: middles (B, 2) of their boxes and radii (B,) around these, and the first
+    ``counts`` (B,) of V walls each: corners (B, V, 2) where they begin, edges (B, V, 2) to where they end,
+    the edges' lengths, and normals (B, V, 2) that point outwards."""
 
-    vertices_m: FloatArray
     middles_m: FloatArray
     radii_m: FloatArray
+    counts: NDArray[np.int64]
+    corners_m: FloatArray
+    edges_m: FloatArray
+    lengths_m: FloatArray
+    normals: FloatArray
 
 
 @dataclass(frozen=True)
@@ -46,9 +51,16 @@ class Alignment:
 
 
 def walls(vertices_m: FloatArray) -> Walls:
-    """The walls of outlines (B, V, 2)."""
+    """The walls of outlines (B, V, 2), counter-clockwise; vertices that repeat make none."""
+    edges = np.roll(vertices_m, -1, axis=1) - vertices_m
+    lengths = np.hypot(edges[:, :, 0], edges[:, :, 1])
+    first = np.argsort(lengths == 0.0, axis=1, kind="stable")
+    corners, edges = (np.take_along_axis(of, first[:, :, None], axis=1) for of in (vertices_m, edges))
+    lengths = np.take_along_axis(lengths, first, axis=1)
+    outwards = np.stack([edges[:, :, 1], -edges[:, :, 0]], axis=2) / np.maximum(lengths, 1e-9)[:, :, None]
     low, high = vertices_m.min(axis=1), vertices_m.max(axis=1)
-    return Walls(np.ascontiguousarray(vertices_m), (low + high) / 2.0, np.hypot(*(high - low).T) / 2.0)
+    radii, counts = np.hypot(*(high - low).T) / 2.0, (lengths > 0.0).sum(axis=1)
+    return Walls((low + high) / 2.0, radii, counts, corners, edges, lengths, outwards)
 
 
 def align(outlines_m: FloatArray, reference: Walls) -> Alignment:
@@ -61,8 +73,8 @@ def align(outlines_m: FloatArray, reference: Walls) -> Alignment:
     shifts, moments = np.zeros((count, 2)), np.zeros((count, 2, 2))
     seen = np.zeros(len(reference.radii_m), dtype=bool)
     _align(
-        outlines_m, normals, reference.vertices_m, reference.middles_m, reference.radii_m, buildings, shifts,
-        moments, seen,
+        outlines_m, normals, reference.middles_m, reference.radii_m, reference.counts, reference.corners_m,
+        reference.edges_m, reference.lengths_m, reference.normals, buildings, shifts, moments, seen,
     )  # fmt: skip
     shares, axes = np.linalg.eigh(moments)
     certainty = np.einsum("nij,nj,nkj->nik", axes, np.minimum(1.0, shares / FULL), axes)
@@ -70,9 +82,12 @@ def align(outlines_m: FloatArray, reference: Walls) -> Alignment:
 
 
 @njit(nogil=True, cache=True)
-def _align(outlines, normals, vertices, middles, radii, buildings, shifts, moments, seen):  # type: ignore[no-untyped-def]
+def _align(  # type: ignore[no-untyped-def]
+    outlines, normals, middles, radii, counts, corners, edges, lengths, outwards, buildings, shifts, moments,
+    seen,
+):  # fmt: skip
     """``moments`` become the sums of w n n' over the points, w their weights over the number of points."""
-    points, corners = outlines.shape[1], vertices.shape[1]
+    points = outlines.shape[1]
     votes = np.zeros(len(radii), np.int64)
     near = np.empty(len(radii), np.int64)
     for i in range(len(outlines)):
@@ -80,8 +95,8 @@ def _align(outlines, normals, vertices, middles, radii, buildings, shifts, momen
         radius = np.sqrt(np.max((outlines[i, :, 0] - x) ** 2 + (outlines[i, :, 1] - y) ** 2))
         count = 0
         for b in range(len(radii)):
-            reach = radius + radii[b] + REACH_M[0]
-            if radii[b] > 0.0 and (middles[b, 0] - x) ** 2 + (middles[b, 1] - y) ** 2 < reach * reach:
+            within = radius + radii[b] + REACH_M[0]
+            if counts[b] > 0 and (middles[b, 0] - x) ** 2 + (middles[b, 1] - y) ** 2 < within * within:
                 near[count] = b
                 count += 1
         dx, dy, covered, xx, xy, yy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -90,25 +105,24 @@ def _align(outlines, normals, vertices, middles, radii, buildings, shifts, momen
             votes[near[:count]] = 0
             for k in range(points):
                 u, v = outlines[i, k, 0] + dx, outlines[i, k, 1] + dy
+                nx, ny = normals[i, k, 0], normals[i, k, 1]
                 best, owner, wall_x, wall_y, away = reach * reach, -1, 0.0, 0.0, 0.0
                 for c in range(count):
                     b = near[c]
-                    for e in range(corners):
-                        ax, ay = vertices[b, e, 0], vertices[b, e, 1]
-                        f = e + 1 if e + 1 < corners else 0
-                        ex, ey = vertices[b, f, 0] - ax, vertices[b, f, 1] - ay
-                        squared = ex * ex + ey * ey
-                        if squared == 0.0:
+                    within = radii[b] + reach
+                    if (middles[b, 0] - u) ** 2 + (middles[b, 1] - v) ** 2 > within * within:
+                        continue
+                    for e in range(counts[b]):
+                        if outwards[b, e, 0] * nx + outwards[b, e, 1] * ny < FACING:
                             continue
-                        length = np.sqrt(squared)
-                        nx, ny = ey / length, -ex / length
-                        if nx * normals[i, k, 0] + ny * normals[i, k, 1] < FACING:
-                            continue
-                        t = min(1.0, max(0.0, ((u - ax) * ex + (v - ay) * ey) / squared))
-                        gx, gy = ax + t * ex - u, ay + t * ey - v
+                        ex, ey, length = edges[b, e, 0], edges[b, e, 1], lengths[b, e]
+                        gx, gy = corners[b, e, 0] - u, corners[b, e, 1] - v
+                        t = min(1.0, max(0.0, -(gx * ex + gy * ey) / (length * length)))
+                        gx, gy = gx + t * ex, gy + t * ey
                         if gx * gx + gy * gy < best:
-                            best, owner, wall_x, wall_y = gx * gx + gy * gy, b, nx, ny
-                            away = gx * nx + gy * ny
+                            best, owner = gx * gx + gy * gy, b
+                            wall_x, wall_y = outwards[b, e, 0], outwards[b, e, 1]
+                            away = gx * wall_x + gy * wall_y
                 if owner < 0:
                     continue
                 votes[owner] += 1

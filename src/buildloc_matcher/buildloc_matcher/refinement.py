@@ -20,6 +20,7 @@ from buildloc_matcher.point_grid import within
 from buildloc_matcher.reference.buildings import OUTLINE_UNIT_M
 from buildloc_matcher.window import (
     Pairing,
+    Pairs,
     Solution,
     State,
     Window,
@@ -37,7 +38,7 @@ RIVAL_M = 20.0  # another optimum is sought within this distance
 RIVAL_CELL_M = 3.0
 RIVAL_TURN_RAD = math.radians(4.0)
 RIVALS = 4  # shifts tried
-SETTLING_ROUNDS = 3
+KEPT = (8, 4, 4)  # the best after each rigid step
 SOME = 80  # observations: enough to tell one place from another
 SAME_M = 2.0  # optima nearer than this, or than three sigma, are one
 ONE_BUILDING_M = 3.0
@@ -100,7 +101,7 @@ def refine(
     for distance_m in np.geomspace(
         config.refine_distance_m, config.refine_last_distance_m, config.refine_iterations
     ):
-        moved = _moved_as_one(window, moved, partial(associate, reference=tree, distance_m=distance_m))
+        moved = _moved_as_one(window, moved, associate(window, moved, tree, distance_m))
     starts = [moved, state, *(moved.moved(by) for by in _elsewhere(placed(window, moved), tree))]
     for pairing in _pairings(window, reference, rows, tree, config):
         optima = _Optima(window, state, starts, pairing, config)
@@ -132,9 +133,8 @@ def _pairings(
     return [partial(associate_outlines, reference=walls(reference.buildings_m[rows, None] + about)), nearest]
 
 
-def _moved_as_one(window: Window, state: State, pairing: Pairing) -> State:
+def _moved_as_one(window: Window, state: State, pairs: Pairs) -> State:
     """The rigid step that brings all pairs together best; none for fewer than three."""
-    pairs = pairing(window, state)
     if len(pairs) < 3:
         return state
     return state.moved(fit_rigid(placed(window, state)[pairs.rows], pairs.targets_m))
@@ -152,17 +152,20 @@ class _Optima:
         views = cKDTree(points).query_ball_point(points, ONE_BUILDING_M, return_length=True)
         few = np.linspace(0, count - 1, min(count, SOME)).astype(np.int64)
         self._window, self._weights = window.thinned(few), count / len(few) / views[few]
-        self._coarse, self._pairing, self._config = coarse, pairing, config
-        self._states = list(starts)
-        for _ in range(SETTLING_ROUNDS):
-            self._states = [_moved_as_one(self._window, state, pairing) for state in self._states]
-        self.best = min(self._states, key=self._misfit)
+        self._coarse, self._config = coarse, config
+        states = list(starts)
+        for kept in KEPT:
+            paired = [(state, pairing(self._window, state)) for state in states]
+            paired.sort(key=lambda one: self._misfit(*one))
+            states = [_moved_as_one(self._window, *one) for one in paired[:kept]]
+        self._found = [(state, pairing(self._window, state)) for state in states]
+        self._found.sort(key=lambda one: self._misfit(*one))
+        self.best = self._found[0][0]
 
-    def _misfit(self, state: State, growth: float = 1.0) -> float:
+    def _misfit(self, state: State, pairs: Pairs, growth: float = 1.0) -> float:
         """Nats, of errors that are ``growth`` times as large as the parameters have them."""
         sigma_m = growth * math.hypot(self._config.sigma_frame_m, self._config.sigma_building_m)
         alone = cauchy((self._config.refine_last_distance_m / sigma_m) ** 2)
-        pairs = self._pairing(self._window, state)
         apart = pairs.targets_m - placed(self._window, state)[pairs.rows]
         told = np.einsum("pi,pij,pj->p", apart, pairs.certainty, apart)
         costs = np.full(len(self._weights), alone)
@@ -174,10 +177,10 @@ class _Optima:
         """How far from the best another optimum lies that fits nearly as well; None where there is none."""
         spread_m = math.sqrt(float(np.linalg.eigvalsh(solution.covariance[:2, :2])[-1]))
         points = placed(self._window, self.best)
-        bar = self._misfit(self.best, solution.growth) + self._config.min_optimum_lead
-        for state in self._states:
+        bar = self._misfit(*self._found[0], solution.growth) + self._config.min_optimum_lead
+        for state, pairs in self._found[1:]:
             away = math.sqrt(float(np.mean(np.sum((placed(self._window, state) - points) ** 2, axis=1))))
-            if away > max(SAME_M, 3.0 * spread_m) and self._misfit(state, solution.growth) < bar:
+            if away > max(SAME_M, 3.0 * spread_m) and self._misfit(state, pairs, solution.growth) < bar:
                 return away
         return None
 

@@ -25,7 +25,7 @@ SHORTEST_STEP_M = 1.0
 CAUCHY = 2.385  # 95 % as efficient as least squares where errors are normal
 RAYLEIGH_MEDIAN = math.sqrt(2.0 * math.log(2.0))  # of the length of a plane vector of unit variance per axis
 ROUNDS = 10
-CONVERGED_M, CONVERGED_RAD = 0.01, 1e-4
+CONVERGED_M, CONVERGED_RAD = 0.02, 2e-4
 
 
 @dataclass(frozen=True)
