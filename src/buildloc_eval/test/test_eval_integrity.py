@@ -79,17 +79,17 @@ def first(kind: str, detail: str = "") -> int:
     return next(n for n in numbers if detail in trial(TINY, 1, n).detail)
 
 
-def test_a_fifth_of_all_trials_are_controls_of_equal_kinds_everywhere() -> None:
-    for plan in (TEST, CALIBRATION):
-        drawn = [trial(plan, 1, n) for n in range(4000)]
-        assert Counter(one.kind for one in drawn) == {FLIGHT: 3200} | dict.fromkeys(CONTROLS, 100)
-        for place in plan.places:
-            here = {one.kind for one in drawn if one.place == place}
-            assert here == {FLIGHT, *CONTROLS}
-        largest = [one.radius_km == one.place.radii_km[-1] for one in drawn if not one.control]
-        assert np.mean(largest) == pytest.approx(0.7, abs=0.03)
-        # The paper's preset is tried on all kinds alike.
-        assert {one.kind for one in drawn if one.paper} == {FLIGHT, *CONTROLS}
+def test_a_fifth_of_the_test_and_all_of_the_calibration_are_controls_of_equal_kinds() -> None:
+    tested = [trial(TEST, 1, n) for n in range(4000)]
+    assert Counter(one.kind for one in tested) == {FLIGHT: 3200} | dict.fromkeys(CONTROLS, 100)
+    largest = [one.radius_km == one.place.radii_km[-1] for one in tested if not one.control]
+    assert np.mean(largest) == pytest.approx(0.7, abs=0.03)
+    calibrated = [trial(CALIBRATION, 1, n) for n in range(2400)]
+    assert Counter(one.kind for one in calibrated) == dict.fromkeys(CONTROLS, 300)
+    for drawn, kinds in ((tested, {FLIGHT, *CONTROLS}), (calibrated, {*CONTROLS})):
+        for place in {one.place for one in drawn}:
+            assert {one.kind for one in drawn if one.place == place} == kinds
+        assert {one.kind for one in drawn if one.paper} == kinds  # the paper's preset has its share of all
 
 
 def test_a_trial_is_that_of_its_number_seed_and_plan() -> None:
@@ -233,6 +233,14 @@ def test_the_report_is_made_of_the_trials(records: pd.DataFrame, tmp_path: Path)
     page = (tmp_path / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 5 and "two invented towns" in page
     assert "two invented towns" in said and "false" in said
+
+
+def test_a_calibration_is_reported_without_flights(records: pd.DataFrame, tmp_path: Path) -> None:
+    controls = records[records.control]
+    write(tmp_path, report_of(controls, CALIBRATION, 30_000, 1), controls)
+    kept = json.loads((tmp_path / "report.json").read_text())
+    assert kept["bars"][1]["reached"]["share"] is None and kept["bars"][1]["met"] == "-"
+    assert (tmp_path / "report.html").read_text().count("data:image/png;base64,") == 1
 
 
 def test_shares_have_exact_intervals_and_nothing_has_the_rule_of_three() -> None:
