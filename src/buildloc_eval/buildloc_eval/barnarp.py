@@ -170,15 +170,22 @@ def _true_buildings(
 
 
 def fly_live(
-    case: Case, ground: Ground, database: ReferenceDatabase, database_path: Path, folder: Path, seed: int
+    case: Case,
+    ground: Ground,
+    database: ReferenceDatabase,
+    database_path: Path,
+    folder: Path,
+    seed: int,
+    rate: float,
 ) -> LiveFlight:
-    """Bag and live nodes of one flight; ``folder`` takes what they write."""
+    """Bag and live nodes of one flight, at a speed relative to the recording; ``folder`` takes what they
+    write."""
     folder.mkdir(parents=True, exist_ok=True)
     bag = folder / "bag"
     make_bag(case, ground, bag, seed)
     settings = load(None, case.overrides)
     settings[REFERENCE_DB]["database"] = str(database_path.resolve())
-    return evaluate_live(bag, database, settings, RATE, folder, f"Barnarp (real imagery): {case.title}")
+    return evaluate_live(bag, database, settings, rate, folder, f"Barnarp (real imagery): {case.title}")
 
 
 def run_case(
@@ -192,7 +199,7 @@ def run_case(
 ) -> tuple[dict[str, Any], LiveFlight]:
     """Bag, live nodes, offline scores of one flight."""
     folder = out / case.name
-    live = fly_live(case, ground, database, database_path, folder, seed)
+    live = fly_live(case, ground, database, database_path, folder, seed, RATE)
     offline = offline_scores(folder / "bag", ground, data, database, load(None, case.overrides))
     accepted = [r for r in live.results if isinstance(r, Fix)]
     figures = {

@@ -188,6 +188,10 @@ def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
         help="ground and seeds: the test's (default), or those that acceptance is calibrated on",
     )  # fmt: skip
     group.add_argument("--trials", type=_count, metavar="N", help="how many (default: 30000, quick: 400)")
+    group.add_argument(
+        "--write-calibration", type=Path, metavar="FILE",
+        help="fit acceptance to the calibration's trials, write it here",
+    )  # fmt: skip
     group = parser.add_argument_group("eval segmentation")
     group.add_argument(
         "--case", action="append", default=[], metavar="PLACE=MODEL", dest="cases",
@@ -221,8 +225,10 @@ def run_eval(args: argparse.Namespace) -> int:
         raise BuildlocError(f"--levels is of `eval scale`, not of `eval {args.name}`")
     if args.name != "paper" and (args.parts or args.models):
         raise BuildlocError(f"--parts and --model are of `eval paper`, not of `eval {args.name}`")
-    if args.name != "integrity" and (args.plan or args.trials):
-        raise BuildlocError(f"--plan and --trials are of `eval integrity`, not of `eval {args.name}`")
+    if args.name != "integrity" and (args.plan or args.trials or args.write_calibration):
+        raise BuildlocError(
+            f"--plan, --trials and --write-calibration are of `eval integrity`, not of `eval {args.name}`"
+        )
     if args.name == "scale":
         from buildloc_eval import scale
 
@@ -236,7 +242,11 @@ def run_eval(args: argparse.Namespace) -> int:
         from buildloc_eval.integrity import evaluate as integrity
 
         plan = args.plan or "test"
-        print(integrity.evaluate(args.out, plan, args.trials, args.seed, args.quick, _stage))
+        print(
+            integrity.evaluate(
+                args.out, plan, args.trials, args.seed, args.quick, _stage, args.write_calibration
+            )
+        )
     elif args.name == "mapping":
         from buildloc_eval import mapping
 

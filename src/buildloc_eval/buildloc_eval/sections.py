@@ -15,14 +15,15 @@ PICTURES = "pictures"  # of the scores: (caption, file in the folder) of each
 
 
 def source_digest(names: Iterable[str]) -> str:
-    """Changes when the source of a module does, or of any module of a package among them."""
+    """Changes when the source of a module does, or any module or measured figures (JSON) of a package."""
     digest = hashlib.sha256()
     for name in sorted(names):
         found = importlib.util.find_spec(name)
         if found is None or found.origin is None:
             raise ModuleNotFoundError(name)
         file = Path(found.origin)
-        for path in sorted(file.parent.rglob("*.py")) if found.submodule_search_locations else [file]:
+        everything = (p for p in file.parent.rglob("*") if p.suffix in (".py", ".json"))
+        for path in sorted(everything) if found.submodule_search_locations else [file]:
             digest.update(path.name.encode() + path.read_bytes())
     return digest.hexdigest()
 

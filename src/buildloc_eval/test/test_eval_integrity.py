@@ -79,17 +79,23 @@ def first(kind: str, detail: str = "") -> int:
     return next(n for n in numbers if detail in trial(TINY, 1, n).detail)
 
 
-def test_a_fifth_of_the_test_and_all_of_the_calibration_are_controls_of_equal_kinds() -> None:
-    tested = [trial(TEST, 1, n) for n in range(4000)]
-    assert Counter(one.kind for one in tested) == {FLIGHT: 3200} | dict.fromkeys(CONTROLS, 100)
-    largest = [one.radius_km == one.place.radii_km[-1] for one in tested if not one.control]
+@pytest.mark.parametrize(("plan", "flights"), [(TEST, 3200), (CALIBRATION, 0)], ids=["test", "calibration"])
+def test_controls_of_equal_kinds_everywhere(plan: Plan, flights: int) -> None:
+    drawn = [trial(plan, 1, n) for n in range(4000)]
+    kinds = dict.fromkeys(CONTROLS, (4000 - flights) // len(CONTROLS)) | (
+        {FLIGHT: flights} if flights else {}
+    )
+    assert Counter(one.kind for one in drawn) == kinds
+    for place in plan.places:
+        assert {one.kind for one in drawn if one.place == place} == set(kinds)
+    # The paper's preset is tried on all kinds alike.
+    assert {one.kind for one in drawn if one.paper} == set(kinds)
+
+
+def test_most_flights_are_searched_for_in_the_largest_reference() -> None:
+    drawn = [trial(TEST, 1, n) for n in range(4000)]
+    largest = [one.radius_km == one.place.radii_km[-1] for one in drawn if not one.control]
     assert np.mean(largest) == pytest.approx(0.7, abs=0.03)
-    calibrated = [trial(CALIBRATION, 1, n) for n in range(2400)]
-    assert Counter(one.kind for one in calibrated) == dict.fromkeys(CONTROLS, 300)
-    for drawn, kinds in ((tested, {FLIGHT, *CONTROLS}), (calibrated, {*CONTROLS})):
-        for place in {one.place for one in drawn}:
-            assert {one.kind for one in drawn if one.place == place} == kinds
-        assert {one.kind for one in drawn if one.paper} == kinds  # the paper's preset has its share of all
 
 
 def test_a_trial_is_that_of_its_number_seed_and_plan() -> None:

@@ -162,6 +162,10 @@ def test_real_imagery_goes_through_registration_network_and_mapper() -> None:
     drawn = [cv2.imdecode(np.frombuffer(mask, np.uint8), cv2.IMREAD_UNCHANGED) for mask in seen.masks]
     assert {mask.shape for mask in drawn} == {(540, 960)}
     assert {int(v) for mask in drawn for v in np.unique(mask)} <= {0, 255}
+    # The true outlines for masks: every house that is seen whole is one of the reference.
+    faultless = real.make_drawn_maps(FLIGHT, seen.track, moved, MODELS, 1)
+    own = measure(real.own_outlines(FLIGHT, moved))
+    assert share_in_reference(faultless, own.centroids_m) == 1.0
 
 
 def grid_maps(count: int = 3) -> Maps:
@@ -222,6 +226,7 @@ def test_the_report_tells_what_is_real_what_was_left_out_and_what_lost_each_flig
     site = Site(SITE - np.array([240.0, 200.0]), SITE, measure(reference()))
     stores.ground.save(maps_name(FLIGHT, 1), site)
     keep(stores, FLIGHT, plan, 1)
+    keep(stores, real.drawn(FLIGHT), real.drawn_plan(plan), 1)
     second = real_imagery(tmp_path, {FLIGHT.name: stores}, [FLIGHT], found, left_out, plan, 1)
 
     text = write(tmp_path, [first, second], 1, True, 6.0)
@@ -232,6 +237,7 @@ def test_the_report_tells_what_is_real_what_was_left_out_and_what_lost_each_flig
         assert report["what is real"][chapter.title] == what
         assert {row["lost by"] for row in said["failures"]} == {"map has fewer than four buildings"}
         assert all(row["recall@1"] == 0.0 for row in said["results"])
+        assert len(said["results"]) == (4 if chapter is first else 6)
         assert said["flights and references"][0]["of them in the reference"] == pytest.approx(6 / 9)
     held = {row["what"]: row["held"] for row in report["bars"]}
     assert held["Tokyo over osm, reference plateau: default preset, recall@1 at 5 km"] is False

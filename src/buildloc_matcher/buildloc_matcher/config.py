@@ -91,7 +91,7 @@ class MatcherConfig:
         1.5, "error that all buildings of the reference share, per axis, m", 0.0, 10.0
     )
     min_optimum_lead: float = param(
-        10.0, "smallest lead of the refined pose over another one within 20 m that fits too, nats", 0.0, 1e4
+        5.0, "smallest lead of the refined pose over another one within 20 m that fits too, nats", 0.0, 1e4
     )
     min_buildings: int = param(12, "fewest buildings in the map for a fix", 3, 100000)
     min_jaccard: float = param(0.2, "smallest MNN-Jaccard of an accepted candidate", 0.0, 1.0)

@@ -30,6 +30,7 @@ from buildloc_matcher.window import (
     placed,
     solve,
     start,
+    start_sigma_m,
 )
 
 RIVAL_M = 20.0  # another optimum is sought within this distance
@@ -102,7 +103,7 @@ def refine(
         moved = _moved_as_one(window, moved, partial(associate, reference=tree, distance_m=distance_m))
     starts = [moved, state, *(moved.moved(by) for by in _elsewhere(placed(window, moved), tree))]
     for pairing in _pairings(window, reference, rows, tree, config):
-        optima = _Optima(window, starts, pairing, config)
+        optima = _Optima(window, state, starts, pairing, config)
         solution = solve(window, optima.best, pairing, config)
         if solution is not None:
             break
@@ -143,7 +144,7 @@ class _Optima:
     """Where rigid steps lead from several starts, by some of the observations; and which fits best."""
 
     def __init__(
-        self, window: Window, starts: Sequence[State], pairing: Pairing, config: MatcherConfig
+        self, window: Window, coarse: State, starts: Sequence[State], pairing: Pairing, config: MatcherConfig
     ) -> None:
         count = len(window.level_m)
         # Each building counts once, however many frames saw it.
@@ -151,7 +152,7 @@ class _Optima:
         views = cKDTree(points).query_ball_point(points, ONE_BUILDING_M, return_length=True)
         few = np.linspace(0, count - 1, min(count, SOME)).astype(np.int64)
         self._window, self._weights = window.thinned(few), count / len(few) / views[few]
-        self._pairing, self._config = pairing, config
+        self._coarse, self._pairing, self._config = coarse, pairing, config
         self._states = list(starts)
         for _ in range(SETTLING_ROUNDS):
             self._states = [_moved_as_one(self._window, state, pairing) for state in self._states]
@@ -166,7 +167,8 @@ class _Optima:
         told = np.einsum("pi,pij,pj->p", apart, pairs.certainty, apart)
         costs = np.full(len(self._weights), alone)
         costs[pairs.rows] += pairs.covered * np.minimum(0.0, cauchy(told / sigma_m**2) - alone)
-        return float(self._weights @ costs)
+        away = (state.poses - self._coarse.poses)[-1, :2] / start_sigma_m(self._config)
+        return float(self._weights @ costs + 0.5 * away @ away)
 
     def rival_m(self, solution: Solution) -> float | None:
         """How far from the best another optimum lies that fits nearly as well; None where there is none."""

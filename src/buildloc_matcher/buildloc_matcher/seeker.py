@@ -72,6 +72,16 @@ class Seeker:
                 self._become(withdraw(self.pursuit, place))
             return NoFix(tracked.stamp_ns, place)
 
+    def figures(self) -> dict[str, object]:
+        """For /diagnostics: the mode, metres flown since the reference agreed, and what was given up."""
+        pursuit = self.pursuit
+        return {
+            "mode": pursuit.mode.value,
+            "since_agreement_m": pursuit.since_agreement_m,
+            "withdrawals": self.withdrawals,
+            "withdrawn": pursuit.withdrawn,
+        }
+
     def fresh(self, fix: Fix) -> bool:
         """Whether a fix is later than all that were given out; it counts as given out then."""
         with self._lock:

@@ -74,7 +74,7 @@ class Session:
 
     def add_mask(self, mask: Mask) -> Job | None:
         """What a keyframe saw; a mask without its telemetry counts as seen, with nothing in it."""
-        self.latest_stamp_ns = mask.stamp_ns
+        self.latest_stamp_ns = max(self.latest_stamp_ns, mask.stamp_ns)
         seen: FrameObservation | None = None
         self.telemetry_fault = ""
         try:
@@ -125,9 +125,20 @@ class Session:
 
     def locate(self, tracked: Tracked) -> Fix | NoFix:
         """The fix of a tracked frame, or why there is none."""
+        self.latest_stamp_ns = max(self.latest_stamp_ns, tracked.stamp_ns)
         if self.seeker is None:
             return NoFix(tracked.stamp_ns, self.reason)
         return self.seeker.locate(tracked)
+
+    def failed(self, reason: str) -> None:
+        """A job had no answer at all, and why."""
+        if self.seeker is not None:
+            self.seeker.reason = reason
+
+    def figures(self) -> dict[str, object]:
+        """For /diagnostics."""
+        counts = {"frames_unusable": self.frames_unusable, "maps_skipped": self.maps_skipped}
+        return {"database": self.database_path} | counts | (self.seeker.figures() if self.seeker else {})
 
     def waiting(self) -> NoFix:
         """No position right now, at the capture time of the latest image."""

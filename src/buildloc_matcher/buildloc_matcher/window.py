@@ -114,6 +114,11 @@ def start(coarse: Similarity, keyframes: Sequence[Keyframe]) -> State:
     return State(placed, np.array([0.0, math.log(coarse.scale)]))
 
 
+def start_sigma_m(config: MatcherConfig) -> float:
+    """Error of the start, per axis: its buildings are sought within three of them."""
+    return config.refine_distance_m / 3.0
+
+
 def placed(window: Window, state: State) -> FloatArray:
     """(N, 2) observed buildings in the world."""
     poses = state.poses[window.frames]
@@ -254,9 +259,9 @@ class _Fit:
         return information
 
     def _prior(self) -> FloatArray:
-        """(3 K + 2,) information of the start, which is weak, about the last pose and both scales."""
+        """(3 K + 2,) information of the start, which is weak, about the last pose, and of both scales."""
         information = np.zeros(3 * len(self._of_frame) + 2)
-        place, turn = self._config.refine_distance_m, math.radians(self._config.rotation_tolerance_deg)
+        place, turn = start_sigma_m(self._config), math.radians(self._config.rotation_tolerance_deg)
         information[-5:] = 1.0 / np.square([place, place, turn, *2 * [self._config.sigma_scale]])
         return information
 

@@ -7,6 +7,7 @@ import sys
 from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from typing import Any, TypeVar
 
 import rclpy
@@ -131,6 +132,16 @@ class Worker:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
 
+def subscribe_telemetry(node: Node, take: Callable[[str, Any], None]) -> None:
+    """Call ``take`` with topic and message of everything that goes with an image."""
+    for kind, topic in (
+        (CameraInfo, topics.CAMERA_INFO),
+        (Range, topics.ALTITUDE),
+        (QuaternionStamped, topics.GIMBAL_ATTITUDE),
+    ):
+        node.create_subscription(kind, topic, partial(take, topic), qos.TELEMETRY)
+
+
 class FrameAssembler:
     """Subscribes to images and telemetry; calls ``on_frame`` with each complete frame.
 
@@ -144,23 +155,15 @@ class FrameAssembler:
         self._on_frame = on_frame
         self._diagnostics = diagnostics
         self._messages = self._messages_before = 0
-        for kind, topic, profile in (
-            (Image, topics.IMAGE, qos.SENSOR),
-            (CompressedImage, topics.IMAGE_COMPRESSED, qos.SENSOR),
-            (CameraInfo, topics.CAMERA_INFO, qos.TELEMETRY),
-            (Range, topics.ALTITUDE, qos.TELEMETRY),
-            (QuaternionStamped, topics.GIMBAL_ATTITUDE, qos.TELEMETRY),
-        ):
-            node.create_subscription(kind, topic, self._handler(topic), profile)
+        for kind, topic in ((Image, topics.IMAGE), (CompressedImage, topics.IMAGE_COMPRESSED)):
+            node.create_subscription(kind, topic, partial(self._on_message, topic), qos.SENSOR)
+        subscribe_telemetry(node, self._on_message)
         clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = node.create_timer(FLUSH_PERIOD_S, self._on_timer, clock=clock)
 
-    def _handler(self, topic: str) -> Callable[[Any], None]:
-        def handle(message: Any) -> None:
-            self._messages += 1
-            self._deliver(self.pairing.add(topic, message))
-
-        return handle
+    def _on_message(self, topic: str, message: Any) -> None:
+        self._messages += 1
+        self._deliver(self.pairing.add(topic, message))
 
     def _on_timer(self) -> None:
         """Let waiting images go after a whole period without any message: the telemetry has stopped."""

@@ -1,8 +1,12 @@
-"""A node's parameters come from its config dataclass: values, ranges, and one line for a wrong one."""
+"""A node's parameters come from its config dataclass: values, ranges, and one line for a wrong one. Its
+workers tell it what came of their work."""
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,9 +16,10 @@ pytest.importorskip("rclpy", reason="ROS is not installed")
 
 import rclpy
 from buildloc_msgs_py.config import ConfigError, param
-from buildloc_msgs_py.ros_node import declare_config
-from drone import domain_id
+from buildloc_msgs_py.ros_node import Worker, declare_config
+from drone import DEADLINE_S, domain_id
 from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -72,3 +77,50 @@ def test_parameters_are_read_and_described_with_their_ranges(make: Make) -> None
 def test_a_wrong_value_is_named_with_its_range(make: Make, values: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         declare_config(make(**values), Config)
+
+
+def spin_until(node: Node, condition: Callable[[], object]) -> None:
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    deadline = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < deadline
+        executor.spin_once(timeout_sec=0.02)
+
+
+def test_a_worker_tells_what_came_of_its_work_in_order_and_on_the_executor(make: Make) -> None:
+    node, told = make(), list[tuple[object, str]]()
+    worker = Worker(node, "work")
+
+    def fail() -> int:
+        raise ValueError("no")
+
+    def tell(done: Future[int]) -> None:
+        told.append((done.exception() or done.result(), threading.current_thread().name))
+
+    for work in (lambda: 1, fail, lambda: 3):
+        worker.submit(work, tell)
+    spin_until(node, lambda: len(told) == 3)
+    (first, second, third), threads = zip(*told, strict=True)
+    assert (first, third) == (1, 3) and isinstance(second, ValueError)
+    assert set(threads) == {threading.current_thread().name}
+    worker.shutdown()
+
+
+def test_what_a_worker_is_to_forget_is_never_told(make: Make) -> None:
+    node, told, begun, go_on = make(), list[object](), threading.Event(), threading.Event()
+    worker = Worker(node, "work")
+
+    def wait() -> bool:
+        begun.set()
+        return go_on.wait(DEADLINE_S)
+
+    worker.submit(wait, told.append)
+    worker.submit(lambda: None, told.append)
+    assert begun.wait(DEADLINE_S)
+    threading.Timer(0.0, go_on.set).start()
+    worker.forget()
+    worker.submit(lambda: None, lambda done: told.append("after"))
+    spin_until(node, lambda: told)
+    assert told == ["after"]
+    worker.shutdown()

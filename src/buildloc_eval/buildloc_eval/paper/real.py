@@ -29,7 +29,7 @@ from buildloc_eval.cut import keyframe_stamps
 from buildloc_eval.flight import Box, FlightConfig, fly, margin_m
 from buildloc_eval.orthos import LabelledGround, banepa, barnarp
 from buildloc_eval.paper.flights import EPSG
-from buildloc_eval.paper.flown import Maps, Track, frames, limit_threads, link, map_flight, shots
+from buildloc_eval.paper.flown import Maps, Track, frames, limit_threads, link, map_flight, masks, shots
 from buildloc_eval.paper.plan import Models, Plan, Stores, maps_name
 from buildloc_eval.paper.published import LARGE_RADII_KM
 from buildloc_eval.paper.sources import measure, read_boston, usable
@@ -37,7 +37,7 @@ from buildloc_eval.paper.stages import Area, Job, Say, Search, predict, side_by_
 from buildloc_eval.paper.store import Store
 from buildloc_eval.realworld import HOLE_MARGIN_M, data_folder
 from buildloc_eval.segmentation import Case, EvaluationError, refuse_known_ground, trained_on
-from buildloc_eval.segmentation_errors import Outlines
+from buildloc_eval.segmentation_errors import Outlines, SegmentationErrors
 from buildloc_eval.world import PictureWorld
 
 CODE = (
@@ -86,6 +86,12 @@ FLIGHTS = (
     # Labels cover 440 x 570 m: three legs are all that fits without a frame beyond them.
     RealFlight("banepa", "banepa", banepa, Surveyed(1.0, 330.0, 80.0)),
 )
+# No errors: true outlines as a segmenter would draw them.
+FAULTLESS = SegmentationErrors(
+    true=0, missed=0.0, merged=0.0, split=0.0, false_per_km2=0.0, false_share=0.0, false_median_m2=0.0,
+    centroid_sigma_m=0.0, log_area_bias=0.0, log_area_sigma=0.0, shape_sigma=(0.0, 0.0, 0.0, 0.0),
+    outline_m=0.0, twice=0, flicker=0.0, centroid_frame_sigma_m=0.0, false_again=0.0,
+)  # fmt: skip
 SHORT = RealFlight("barnarp_short", "barnarp", barnarp, Surveyed(0.6, 450.0, 100.0))
 
 STAR_METHODS = ("paper preset", "default preset")
@@ -93,6 +99,17 @@ FULL = Plan(
     tuple(flight.name for flight in FLIGHTS), 10, LARGE_RADII_KM, {"default preset": (6,)}, 1, STAR_METHODS
 )  # fmt: skip
 QUICK = Plan((SHORT.name,), 1, (6,), {}, 0, STAR_METHODS)
+
+
+def drawn(flight: RealFlight) -> RealFlight:
+    """The same flights with the true outlines for masks: what these find and the network's do not, the
+    network has lost."""
+    return replace(flight, name=f"{flight.name}_drawn")
+
+
+def drawn_plan(plan: Plan) -> Plan:
+    """What is run of them: the default preset, whole flights."""
+    return replace(plan, prefixes={}, methods=STAR_METHODS[1:])
 
 
 @dataclass(frozen=True)
@@ -261,21 +278,27 @@ def _packed(mask: ByteArray) -> bytes:
 def make_maps(seen: Seen, models: Models) -> Maps:
     """What the mapper makes of them."""
     limit_threads()
-    masks = (
+    unpacked = (
         Mask(shot.stamp_ns, topics.FRAME_CAMERA, _unpacked(mask))
         for shot, mask in zip(seen.track.shots, seen.masks, strict=True)
     )
-    return map_flight(seen.track, masks, models.mapper)
+    return map_flight(seen.track, unpacked, models.mapper)
 
 
 def _unpacked(mask: bytes) -> ByteArray:
     return np.asarray(cv2.imdecode(np.frombuffer(mask, np.uint8), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
 
 
-def shown(flight: RealFlight, site: Site) -> Outlines:
+def make_drawn_maps(flight: RealFlight, track: Track, moved_m: FloatArray, models: Models, seed: int) -> Maps:
+    """What the mapper makes of the true outlines in the network's stead."""
+    limit_threads()
+    return map_flight(track, masks(track, own_outlines(flight, moved_m), FAULTLESS, seed), models.mapper)
+
+
+def own_outlines(flight: RealFlight, moved_m: FloatArray) -> Outlines:
     """The place's own outlines where they are set into the city."""
     outlines = usable(flight.read(data_folder()).outlines)
-    return np.asarray(shapely.transform(outlines, lambda xy: xy + site.moved_m))
+    return np.asarray(shapely.transform(outlines, lambda xy: xy + moved_m))
 
 
 def area(store: Store, name: str) -> Area:
@@ -303,10 +326,14 @@ def run(
         moved = stores.ground.load(names[s]).moved_m
         jobs.append((names[s], 1.0, partial(see, flight, moved, network, models, s)))
     side_by_side(jobs, stores.tracks, f"{flight.name}: registering and segmenting", say)
-    missing = [name for name in names.values() if not stores.maps.has(name)]
-    side_by_side(
-        [(name, 1.0, partial(make_maps, stores.tracks.load(name), models)) for name in missing],
-        stores.maps, f"mapping {flight.name}", say,
-    )  # fmt: skip
-    searches = [Search(flight, (s,), partial(area, stores.ground, names[s])) for s in seeds]
-    predict(stores, searches, plan, seed, say)
+    jobs, other = [], drawn(flight)
+    for s, name in names.items():
+        if not (stores.maps.has(name) and stores.maps.has(maps_name(other, s))):
+            seen, moved = stores.tracks.load(name), stores.ground.load(name).moved_m
+            jobs.append((name, 1.0, partial(make_maps, seen, models)))
+            remade = partial(make_drawn_maps, flight, seen.track, moved, models, s)
+            jobs.append((maps_name(other, s), 1.0, remade))
+    side_by_side(jobs, stores.maps, f"mapping {flight.name}", say)
+    for one, its_plan in ((flight, plan), (other, drawn_plan(plan))):
+        searches = [Search(one, (s,), partial(area, stores.ground, names[s])) for s in seeds]
+        predict(stores, searches, its_plan, seed, say)
