@@ -241,6 +241,14 @@ def test_the_report_is_made_of_the_trials(records: pd.DataFrame, tmp_path: Path)
     assert "two invented towns" in said and "false" in said
 
 
+def test_a_calibration_is_reported_without_flights(records: pd.DataFrame, tmp_path: Path) -> None:
+    controls = records[records.control]
+    write(tmp_path, report_of(controls, CALIBRATION, 30_000, 1), controls)
+    kept = json.loads((tmp_path / "report.json").read_text())
+    assert kept["bars"][1]["reached"]["share"] is None and kept["bars"][1]["met"] == "-"
+    assert (tmp_path / "report.html").read_text().count("data:image/png;base64,") == 1
+
+
 def test_shares_have_exact_intervals_and_nothing_has_the_rule_of_three() -> None:
     assert scoring.share(0, 300) == {"share": 0.0, "of": 300, "95%": [0.0, 0.01]}
     half = scoring.share(5, 10)
