@@ -27,7 +27,7 @@ class CropConfig:
     scenes, decoys and weather at this strength."""
 
     rendered_share: float = 0.4
-    rendered_scenes: int = 400
+    rendered_scenes: int = 1200
     decoy_share: float = 0.3
     scale: float = 1.4
     tilt: float = 0.06

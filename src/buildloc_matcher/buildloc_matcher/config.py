@@ -96,7 +96,7 @@ class MatcherConfig:
     min_buildings: int = param(12, "fewest buildings in the map for a fix", 3, 100000)
     min_jaccard: float = param(0.2, "smallest MNN-Jaccard of an accepted candidate", 0.0, 1.0)
     target_false_fix_rate: float = param(
-        1e-5, "how often a map that lies nowhere near may be accepted, at most", 1e-12, 0.5
+        1e-4, "how often a map that lies nowhere near may be accepted, at most", 1e-12, 0.5
     )
     rival_distance_m: float = param(15.0, "candidates further away than this are elsewhere, m", 0.0, 1e6)
     min_pairs: int = param(10, "fewest distinct reference buildings matched for a fix", 3, 100000)

@@ -20,7 +20,7 @@ from buildloc_eval.integrity.scoring import wrong_best
 START_NATS = 5.0
 BOUND = 0.95
 FEWEST_ABOVE = 5  # scores of a kind above the start for a scale of its own
-AT_RATE = 1e-5  # where the kinds are compared
+AT_RATE = 1e-4  # where the kinds are compared
 
 
 def fit_tail(scores: FloatArray, other_scale_nats: float = math.nan) -> Tail:
