@@ -116,8 +116,9 @@ def judge_candidate(
 
 def refuse_refined(refined: Refined, config: MatcherConfig) -> str | None:
     """Why the refined pose is not convincing, or None."""
-    if refined.buildings < config.min_pairs:
-        return f"refinement matched {refined.buildings} buildings, fewer than {config.min_pairs}"
+    if refined.buildings < config.refine_min_buildings:
+        few = f"{refined.buildings} buildings, fewer than {config.refine_min_buildings}"
+        return f"refinement matched {few}"
     if refined.rms_m > config.max_residual_m:
         return f"refinement left residuals of {refined.rms_m:.1f} m, above {config.max_residual_m:g} m"
     return None

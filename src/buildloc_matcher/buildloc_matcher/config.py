@@ -99,7 +99,10 @@ class MatcherConfig:
         1e-4, "how often a map that lies nowhere near may be accepted, at most", 1e-12, 0.5
     )
     rival_distance_m: float = param(15.0, "candidates further away than this are elsewhere, m", 0.0, 1e6)
-    min_pairs: int = param(10, "fewest distinct reference buildings matched for a fix", 3, 100000)
+    min_pairs: int = param(10, "fewest buildings of the map matched for a fix", 3, 100000)
+    refine_min_buildings: int = param(
+        5, "fewest distinct reference buildings that the refinement matches for a fix", 3, 1000
+    )
     max_residual_m: float = param(10.0, "largest RMS distance of the matched pairs for a fix, m", 0.1, 1000.0)
     sigma_up_m: float = param(100.0, "standard deviation reported for the altitude, m", 0.1, 10000.0)
     follow_frames: int = param(4, "latest keyframes whose buildings agree with the reference or not", 1, 100)

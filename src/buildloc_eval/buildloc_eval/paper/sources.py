@@ -7,7 +7,7 @@ from pathlib import Path
 import geopandas as gpd
 import numpy as np
 import shapely
-from buildloc_matcher.reference.buildings import Buildings
+from buildloc_matcher.reference.buildings import Buildings, stored_outlines
 from buildloc_msgs_py.footprint import footprints
 from pyproj import Transformer
 
@@ -41,4 +41,5 @@ def usable(outlines: Outlines) -> Outlines:
 def measure(outlines: Outlines) -> Buildings:
     """The outlines as a reference has them."""
     found = footprints(outlines)
-    return Buildings(found.centroids_m, found.areas_m2.astype(np.float32), found.shapes.astype(np.float32))
+    areas, shapes = found.areas_m2.astype(np.float32), found.shapes.astype(np.float32)
+    return Buildings(found.centroids_m, areas, shapes, stored_outlines(outlines, found.centroids_m))
