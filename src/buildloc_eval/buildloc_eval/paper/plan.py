@@ -52,6 +52,8 @@ FULL = Plan(
     tuple(f"flight{n}" for n in range(1, 8)), 10, RADII_KM,
     {"default preset": LARGE_RADII_KM, "paper preset": LARGE_RADII_KM}, 10
 )  # fmt: skip
+# Ground that the network which ships never saw. Those of the other places were trained a twelfth as long.
+ERRORS_OF = "barnarp"
 QUICK = Plan(("flight1", "flight2"), 2, (1, 6, 12), {"default preset": (6,), "paper preset": (6,)}, 2)
 
 
@@ -87,7 +89,7 @@ class Models:
 
 def measured_models() -> Models:
     """With the segmenter's errors as they were measured. Raises ErrorModelError without that file."""
-    return Models(read_errors())
+    return Models(read_errors(ERRORS_OF))
 
 
 class Stores:
