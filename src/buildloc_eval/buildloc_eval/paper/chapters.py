@@ -41,8 +41,8 @@ TOKYO = [
     "people: one is flown over as it is, the other is the reference as it is; the ground's texture "
     "(orthophotos of Barnarp and Banepa, mirrored); registration, mapping, matching and refinement",
     "simulated: the flights, the camera, its telemetry, and the masks (the outlines flown over with the "
-    "errors that the network which ships was measured to make over Barnarp, a suburb it never saw; in a dense "
-    "town such as this a network errs more: see Banepa among the real images)",
+    "errors that the network which ships was measured to make over Barnarp, a suburb it never saw; in a "
+    "dense town such as this a network errs more: see Banepa among the real images)",
 ]
 IMAGERY = [
     "real: the images (orthophotos of Barnarp and Banepa), the network, which never trained on the ground it "

@@ -54,7 +54,8 @@ REAL = [
     "real: the footprints (greater Boston, OpenStreetMap 2021) and the ground's texture (orthophotos of "
     "Barnarp and Banepa, mirrored); registration, mapping, matching and refinement are the system's own",
     "simulated: the flights, the camera, its telemetry, and the masks (true footprints with the "
-    "errors that the network which ships was measured to make over Barnarp, a suburb it never saw); the reference differs from what is flown over as one digitiser from "
+    "errors that the network which ships was measured to make over Barnarp, a suburb it never saw); the "
+    "reference differs from what is flown over as one digitiser from "
     "another and by the errors of automatic mapping that are listed below",
     "the paper's own figures are of seven real flights over Denver with Microsoft's footprints",
 ]
