@@ -90,6 +90,9 @@ class MatcherConfig:
     sigma_registration_m: float = param(
         1.5, "error that all buildings of the reference share, per axis, m", 0.0, 10.0
     )
+    sigma_inflation: float = param(
+        1.2, "factor on the fitted standard deviations, for matches that are wrong", 1.0, 10.0
+    )
     min_optimum_lead: float = param(
         5.0, "smallest lead of the refined pose over another one within 20 m that fits too, nats", 0.0, 1e4
     )

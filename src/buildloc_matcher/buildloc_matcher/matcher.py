@@ -34,6 +34,7 @@ from buildloc_matcher.reference.database import DatabaseError, ReferenceDatabase
 from buildloc_matcher.refinement import Refined, Unrefined, covariance_enu, refine
 from buildloc_matcher.selection import Score, local_transform, select
 from buildloc_matcher.voting import Cluster, vote
+from buildloc_matcher.window import start_covariance
 
 FEWEST_BUILDINGS = 4
 WARM_UP_BUILDINGS = 40
@@ -245,10 +246,17 @@ class Matcher:
         refused = refuse_refined(refined, self.config)
         if refused is not None:
             return none(refused)
+        poses = _refined(refined)
+        seen = seen_in_world(poses, observations, self.config.refine_frames)
+        offset = refined.position_m - coarse.apply(np.array([[last.x_m, last.y_m]]))[0]
+        opinion = ask(seen, offset, start_covariance(self.config), self.database.ground, self.config)
+        funnel |= {"recent_nats": opinion.nats, "recent_lead": opinion.lead}
+        if opinion.outcome is not Outcome.ACCEPTED:
+            return none(f"undecided: the latest frames do not agree: {opinion.reason}")
         funnel |= {"refine_observed": refined.observed, "refine_pairs": refined.pairs}
         funnel |= {"refine_buildings": refined.buildings, "refine_rms_m": refined.rms_m}
         altitude = next((o.altitude_m for o in observations if o.stamp_ns == last.stamp_ns), float("nan"))
-        agreement = Agreement(_refined(refined), refined.covariance, coarse.scale)
+        agreement = Agreement(poses, refined.covariance, coarse.scale)
         place = Place(last.stamp_ns, *agreement.poses[last.stamp_ns], refined.covariance)
         return Answer(self.fix_at(place, altitude), found.candidates, funnel, agreement)
 

@@ -113,7 +113,8 @@ def refine(
     rival_m = optima.rival_m(solution)
     if rival_m is not None:
         return Unrefined(f"refinement found two optima {rival_m:.1f} m apart that fit alike")
-    covariance = solution.covariance + np.diag([*2 * [config.sigma_registration_m**2], 0.0])
+    registration = np.diag([*2 * [config.sigma_registration_m**2], 0.0])
+    covariance = config.sigma_inflation**2 * solution.covariance + registration
     position, yaw = solution.state.poses[-1, :2], float(wrap(solution.state.poses[-1, 2]))
     return Refined(
         position, yaw, covariance, dict(zip(window.stamps_ns, solution.state.poses, strict=True)),

@@ -119,6 +119,12 @@ def start_sigma_m(config: MatcherConfig) -> float:
     return config.refine_distance_m / 3.0
 
 
+def start_covariance(config: MatcherConfig) -> FloatArray:
+    """(3, 3) of the start's last pose over east, north and yaw."""
+    turn = math.radians(config.rotation_tolerance_deg)
+    return np.diag(np.square([start_sigma_m(config), start_sigma_m(config), turn]))
+
+
 def placed(window: Window, state: State) -> FloatArray:
     """(N, 2) observed buildings in the world."""
     poses = state.poses[window.frames]
