@@ -28,8 +28,9 @@ class Tail:
         return math.exp(min(0.0, math.log(self.share) - (nats - self.start_nats) / self.scale_nats))
 
     def quantile(self, rate: float) -> float:
-        """The score that this share of wrong best candidates exceeds, nats."""
-        return self.start_nats + self.scale_nats * math.log(self.share / rate)
+        """The score that this share of wrong best candidates exceeds, nats; never below the start, where
+        nothing was fitted."""
+        return self.start_nats + self.scale_nats * max(0.0, math.log(self.share / rate))
 
 
 @cache

@@ -82,6 +82,7 @@ class MatcherNode(Node):  # type: ignore[misc]
         self._give(self.session.locate(wire.decode_tracked(message)))
 
     def _on_reset(self, message: Empty) -> None:
+        self._next, self._fixed = None, False
         self.session.reset()
         self._pace.reset()
 
@@ -113,9 +114,8 @@ class MatcherNode(Node):  # type: ignore[misc]
         if (error := done.exception()) is not None:
             self.session.failed(f"solving failed: {type(error).__name__}: {error}")
             self.get_logger().error(self.session.waiting().reason)
-        else:
-            answer = done.result()
-            self._funnel = answer.funnel
+        elif job.flight == self.session.flight:
+            self._funnel = (answer := done.result()).funnel
             self._candidates.publish(encode.encode_candidates(answer.candidates, job.local_map.stamp_ns))
             self._give(answer.result)
         self._solve_next()
@@ -124,15 +124,15 @@ class MatcherNode(Node):  # type: ignore[misc]
         """Publish a fix unless a later one is out; the lack of one only when a place was just withdrawn."""
         if (seeker := self.session.seeker) is None:
             return
+        if self._withdrawals != seeker.withdrawals:
+            self._withdrawals = seeker.withdrawals
+            self._fix.publish(encode.encode_fix(self.session.waiting()))
         if isinstance(result, Fix) and seeker.fresh(result):
             self._fixed, self._fixes = True, self._fixes + 1
             self._fix.publish(encode.encode_fix(result))
             self._pose.publish(encode.encode_pose(result))
             late_ns = self.get_clock().now().nanoseconds - result.stamp_ns
             self._pace.add(time.monotonic(), 1e-9 * late_ns)
-        elif self._withdrawals != seeker.withdrawals:
-            self._fix.publish(encode.encode_fix(self.session.waiting()))
-        self._withdrawals = seeker.withdrawals
 
     def _on_tick(self) -> None:
         if not self._fixed:

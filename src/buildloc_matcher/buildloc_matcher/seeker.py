@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -105,9 +106,18 @@ class Seeker:
         with self._lock:
             if flight is not self._flight:
                 return Answer(NoFix(local_map.stamp_ns, "the flight was forgotten meanwhile"), (), {})
-            self.reason = answer.result.reason if isinstance(answer.result, NoFix) else UNTRACKED
             self._become(step(self.pursuit))
+            if isinstance(answer.result, Fix) and self.pursuit.mode is Mode.ACQUIRE:
+                # The place was withdrawn while it was asked about: what was found has nothing to go on from.
+                answer = replace(answer, result=NoFix(answer.result.stamp_ns, self.pursuit.withdrawn))
+            self.reason = answer.result.reason if isinstance(answer.result, NoFix) else UNTRACKED
         return answer
+
+    def failed(self, reason: str) -> None:
+        """A map had no answer at all, and why: what is known grows old."""
+        with self._lock:
+            self.reason = reason
+            self._become(coast(self.pursuit))
 
     def _acquire(
         self, local_map: LocalMap, keyframes: Sequence[Keyframe], observations: Sequence[FrameObservation]

@@ -27,11 +27,12 @@ def frames_kept(config: MatcherConfig) -> int:
 
 @dataclass(frozen=True)
 class Job:
-    """One solve: a map with the keyframes it was made from and what the frames saw."""
+    """One solve: a map with the keyframes it was made from and what the frames saw; which flight it is of."""
 
     local_map: LocalMap
     keyframes: tuple[Keyframe, ...]
     observations: tuple[FrameObservation, ...]
+    flight: int
 
 
 class Session:
@@ -45,6 +46,7 @@ class Session:
         self.reason = "no reference database: call /buildloc/reference/load"
         self.frames_unusable = 0
         self.maps_skipped = 0
+        self.flight = 0
         self._frames: dict[int, FrameObservation | None] = {}
         self._maps: dict[int, LocalMap] = {}
         self._keyframes: dict[int, tuple[Keyframe, ...]] = {}
@@ -52,13 +54,14 @@ class Session:
 
     def reset(self) -> None:
         """Forget the flight, keep the reference."""
+        self.flight += 1
         self.latest_stamp_ns = 0
         self.telemetry_fault = ""
         self.telemetry.reset()
         for flown in (self._frames, self._maps, self._keyframes):
             flown.clear()
-        if self.seeker is not None:
-            self.seeker.reset()
+        if (seeker := self.seeker) is not None:
+            seeker.reset()
 
     def load(self, path: str) -> bool:
         """Open a reference database; on failure there is none, and ``reason`` says why."""
@@ -100,8 +103,8 @@ class Session:
         """The keyframe poses that belong to the map of the last keyframe's stamp."""
         if not keyframes:
             return None
-        if self.seeker is not None:
-            self.seeker.carry(keyframes)
+        if (seeker := self.seeker) is not None:
+            seeker.carry(keyframes)
         stamp_ns = max(k.stamp_ns for k in keyframes)
         self._keyframes[stamp_ns] = keyframes
         return self._complete(stamp_ns)
@@ -115,38 +118,41 @@ class Session:
         if stamp_ns not in self._maps or stamp_ns not in self._keyframes or stamp_ns not in self._frames:
             return None
         seen = tuple(f for f in self._frames.values() if f is not None)
-        return Job(self._maps.pop(stamp_ns), self._keyframes.pop(stamp_ns), seen)
+        return Job(self._maps.pop(stamp_ns), self._keyframes.pop(stamp_ns), seen, self.flight)
 
     def solve(self, job: Job) -> Answer:
         """Answer a job."""
-        if self.seeker is None:
+        if job.flight != self.flight:
+            return Answer(NoFix(job.local_map.stamp_ns, "the flight was forgotten meanwhile"), (), {})
+        if (seeker := self.seeker) is None:
             return Answer(NoFix(job.local_map.stamp_ns, self.reason), (), {})
-        return self.seeker.solve(job.local_map, job.keyframes, job.observations)
+        return seeker.solve(job.local_map, job.keyframes, job.observations)
 
     def locate(self, tracked: Tracked) -> Fix | NoFix:
         """The fix of a tracked frame, or why there is none."""
         self.latest_stamp_ns = max(self.latest_stamp_ns, tracked.stamp_ns)
-        if self.seeker is None:
+        if (seeker := self.seeker) is None:
             return NoFix(tracked.stamp_ns, self.reason)
-        return self.seeker.locate(tracked)
+        return seeker.locate(tracked)
 
     def failed(self, reason: str) -> None:
         """A job had no answer at all, and why."""
-        if self.seeker is not None:
-            self.seeker.reason = reason
+        if (seeker := self.seeker) is not None:
+            seeker.failed(reason)
 
     def figures(self) -> dict[str, object]:
         """For /diagnostics."""
         counts = {"frames_unusable": self.frames_unusable, "maps_skipped": self.maps_skipped}
-        return {"database": self.database_path} | counts | (self.seeker.figures() if self.seeker else {})
+        seeker = self.seeker
+        return {"database": self.database_path} | counts | (seeker.figures() if seeker else {})
 
     def waiting(self) -> NoFix:
         """No position right now, at the capture time of the latest image."""
-        missing = self.telemetry.missing()
-        if self.seeker is None:
+        missing, seeker = self.telemetry.missing(), self.seeker
+        if seeker is None:
             reason = self.reason
         elif missing:
             reason = f"no {', '.join(missing)} received; check that it is published"
         else:
-            reason = self.telemetry_fault or self.seeker.reason
+            reason = self.telemetry_fault or seeker.reason
         return NoFix(self.latest_stamp_ns, reason)

@@ -97,7 +97,7 @@ def test_each_figure_that_falls_short_is_named(found: Score, text: str) -> None:
 def test_the_threshold_follows_from_the_rate_asked_for() -> None:
     tail = Tail(start_nats=4.0, share=0.1, scale_nats=3.0)
     assert tail.exceedance(4.0) == pytest.approx(0.1) and tail.exceedance(-100.0) == 1.0
-    assert tail.quantile(0.1) == pytest.approx(4.0)
+    assert tail.quantile(0.1) == pytest.approx(4.0) == tail.quantile(0.5)  # nothing was fitted below
     for rate in (1e-2, 1e-6):
         assert tail.exceedance(tail.quantile(rate)) == pytest.approx(rate)
     assert threshold(1e-6) > threshold(1e-5) > measured().start_nats

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -181,3 +182,38 @@ def test_a_reset_forgets_the_flight_even_while_it_is_solved(matcher: Scripted, s
     matcher.fix = interrupted  # type: ignore[method-assign]
     assert at_keyframe(seeker, 2) == NoFix(2 * SECOND, "the flight was forgotten meanwhile")
     assert seeker.pursuit.mode is Mode.ACQUIRE and seeker.reason == WAITING
+
+
+def another_map(seeker: Seeker) -> None:
+    """The mapper began a map that has nothing of the one before."""
+    seeker.carry([Keyframe(30 * SECOND, 0.0, 0.0, 0.0), Keyframe(31 * SECOND, 30.0, 0.0, 0.0)])
+
+
+@pytest.mark.parametrize("following", [False, True], ids=["acquiring", "following"])
+def test_a_place_that_is_withdrawn_while_it_is_asked_about_gives_no_fix(following: bool) -> None:
+    matcher = Scripted(check_keyframes=100)
+    seeker = Seeker(matcher)
+    matcher.places += [(500.0, 700.0)]
+    if following:
+        assert isinstance(at_keyframe(seeker, 2), Fix)
+        matcher.outcomes += [Outcome.UNDECIDED]
+    name = "follow" if following else "fix"
+    asked = getattr(matcher, name)
+
+    def interrupted(*arguments: Any) -> Any:
+        another_map(seeker)
+        return asked(*arguments)
+
+    setattr(matcher, name, interrupted)
+    result = at_keyframe(seeker, 3)
+    assert isinstance(result, NoFix) and seeker.pursuit.mode is Mode.ACQUIRE
+    assert result.reason == seeker.reason == seeker.pursuit.withdrawn != ""
+
+
+def test_a_map_without_an_answer_lets_the_place_grow_old() -> None:
+    matcher = Scripted(check_keyframes=100)
+    seeker = Seeker(matcher)
+    matcher.places += [(500.0, 700.0)]
+    assert isinstance(at_keyframe(seeker, 2), Fix)
+    seeker.failed("solving failed: MemoryError")
+    assert seeker.pursuit.mode is Mode.COAST and seeker.reason == "solving failed: MemoryError"

@@ -222,7 +222,9 @@ def decode_tracked(msg: Any) -> Tracked:
             "feed /buildloc/track from the mapper"
         )
     position, spread = msg.pose.pose.position, np.reshape(msg.pose.covariance, (6, 6))
-    height = float(position.z)
+    height, told = float(position.z), np.array([position.x, position.y, position.z, *spread.ravel()])
+    if not (np.isfinite(told).all() and height > 0.0):
+        raise WireError("tracked pose is not finite or has no height; check the altitude source")
     scaled = np.diag([1.0, 1.0, 1.0, 1.0 / height])
     return Tracked(
         stamp_ns(msg), int(keyframe), float(position.x), float(position.y), _yaw(msg.pose.pose.orientation),

@@ -218,6 +218,14 @@ def test_no_fix_has_no_position(travel: Travel) -> None:
     assert wire.decode_fix(message) == NoFix(STAMP, "STATUS_NO_FIX")
 
 
+@pytest.mark.parametrize(("field", "value"), [("z", 0.0), ("z", -1.0), ("x", math.nan), ("y", math.inf)])
+def test_a_tracked_pose_that_is_none_is_refused(field: str, value: float) -> None:
+    message = encode.encode_tracked(Tracked(STAMP, STAMP - 7, 12.0, -3.0, 0.5, 102.0, np.eye(4)))
+    setattr(message.pose.pose.position, field, value)
+    with pytest.raises(wire.WireError, match="not finite or has no height"):
+        wire.decode_tracked(message)
+
+
 @wires
 def test_tracked(travel: Travel) -> None:
     spread = np.random.default_rng(2).normal(size=(4, 4)) * 0.1
