@@ -27,9 +27,10 @@ MAY_IMPORT_ROS = re.compile(
     r"|buildloc\.(replay|fix_listener)"
     r"|buildloc\.launch\..+"
 )
-# One module for the segmentation network, one for all matching networks, and one for the pose graph.
+# One module for the segmentation network, one for all matching networks, one for the baseline NetVLAD, and
+# one for the pose graph.
 ONLY_IN = {
-    "onnxruntime": {"buildloc_segmenter.network", "buildloc_mapper.network"},
+    "onnxruntime": {"buildloc_segmenter.network", "buildloc_mapper.network", "buildloc_eval.paper.netvlad"},
     "gtsam": {"buildloc_mapper.pose_graph"},
 }
 WORLD_SIMULATION = {

@@ -105,6 +105,46 @@ def test_the_papers_network_is_exported_and_runs(tmp_path: Path) -> None:
     assert np.isfinite(logits).all()
 
 
+def test_netvlads_branches_learn_and_export_what_they_learnt(tmp_path: Path) -> None:
+    from netvlad import RADIUS_M, DualBranch, Ground, Training, draw_pairs, export
+
+    torch.manual_seed(0)
+    rng = np.random.default_rng(0)
+    side = round(RADIUS_M)  # at 2 m per pixel
+    town = np.kron(rng.random((side // 8 + 1,) * 2) < 0.2, np.ones((8, 8)))[:side, :side].astype(np.float32)
+    ground = Ground((0.0, 0.0), (town,), (town,))
+    pairs = draw_pairs(ground, 12, rng)
+    assert pairs.views.shape == (12, 2, 64, 64) and pairs.tiles.shape == (12, 1, 64, 64)
+    assert not pairs.views[:, 0][pairs.views[:, 1] == 0.0].any()  # nothing is seen outside the frame
+    training = Training(DualBranch(), 40, torch.device("cpu"))
+    losses = [training.advance(pairs) for _ in range(16)]
+    assert max(losses[-3:]) < 0.7 * min(losses[:3])
+    assert max(export(training.net, tmp_path, pairs).values()) < 1e-4
+    sessions = [
+        onnxruntime.InferenceSession(str(tmp_path / f"{name}.onnx")) for name in ("drone", "reference")
+    ]
+    given = (pairs.views, pairs.tiles)
+    views, tiles = (s.run(None, {"tiles": g})[0] for s, g in zip(sessions, given, strict=True))
+    assert views.shape == tiles.shape == (12, 4096)
+    np.testing.assert_allclose(np.linalg.norm(views, axis=1), 1.0, atol=1e-5)
+    training.save(tmp_path / "checkpoint.pt", {"seed": 1})
+    resumed = Training(DualBranch(), 40, torch.device("cpu"))
+    resumed.restore(tmp_path / "checkpoint.pt", {"seed": 1})
+    np.testing.assert_allclose(resumed.advance(pairs), training.advance(pairs), atol=1e-5)
+
+
+def test_netvlad_starts_from_a_file_of_resnet_weights(tmp_path: Path) -> None:
+    from netvlad import ResNet18
+
+    state = ResNet18(3).state_dict() | {"fc.weight": torch.zeros(1000, 512), "fc.bias": torch.zeros(1000)}
+    torch.save(state, tmp_path / "resnet18.pth")
+    net = ResNet18(2)
+    net.load_pretrained(tmp_path / "resnet18.pth")
+    colours = state["conv1.weight"].mean(dim=1)
+    assert all(torch.equal(net.conv1.weight[:, plane], colours) for plane in (0, 1))
+    assert torch.equal(net.layer4[1].conv2.weight, state["layer4.1.conv2.weight"])
+
+
 def test_an_unknown_network_is_refused() -> None:
     from networks import network
 

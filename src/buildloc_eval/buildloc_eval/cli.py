@@ -182,6 +182,10 @@ def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
         "--model", action="append", default=[], metavar="PLACE=MODEL", dest="models",
         help="ONNX network for real imagery of a place that it never saw; repeatable (default: shipped one)",
     )  # fmt: skip
+    paper.add_argument(
+        "--netvlad", type=Path, metavar="FOLDER",
+        help="networks of the baseline NetVLAD, from training/netvlad.py (default: it is left out)",
+    )  # fmt: skip
     group = parser.add_argument_group("eval integrity")
     group.add_argument(
         "--plan", choices=["test", "calibration"],
@@ -223,8 +227,8 @@ def run_eval(args: argparse.Namespace) -> int:
         )
     if args.name != "scale" and args.levels:
         raise BuildlocError(f"--levels is of `eval scale`, not of `eval {args.name}`")
-    if args.name != "paper" and (args.parts or args.models):
-        raise BuildlocError(f"--parts and --model are of `eval paper`, not of `eval {args.name}`")
+    if args.name != "paper" and (args.parts or args.models or args.netvlad):
+        raise BuildlocError(f"--parts, --model and --netvlad are of `eval paper`, not of `eval {args.name}`")
     if args.name != "integrity" and (args.plan or args.trials or args.write_calibration):
         raise BuildlocError(
             f"--plan, --trials and --write-calibration are of `eval integrity`, not of `eval {args.name}`"
@@ -259,7 +263,9 @@ def run_eval(args: argparse.Namespace) -> int:
         parts = args.parts or paper.PARTS
         if given and "real" not in parts:
             raise BuildlocError("--model is of the part real; add it to --parts")
-        print(paper.evaluate(args.out, args.seed, args.quick, _stage, parts, given))
+        if args.netvlad and "boston" not in parts:
+            raise BuildlocError("--netvlad is of the part boston; add it to --parts")
+        print(paper.evaluate(args.out, args.seed, args.quick, _stage, parts, given, args.netvlad))
     elif args.name == "segmentation":
         from buildloc_eval import segmentation
 

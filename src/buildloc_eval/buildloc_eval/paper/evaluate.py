@@ -6,7 +6,8 @@ Every stage is kept under the output folder, so that a run that is cut off goes 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 import shapely
 from buildloc_matcher.reference.buildings import Buildings
+from buildloc_msgs_py.types import Mask
 
 from buildloc_eval.paper import brm, methods, real, tokyo
 from buildloc_eval.paper.chapters import real_imagery, two_digitisers
@@ -25,6 +27,7 @@ from buildloc_eval.paper.flights import (
 )
 from buildloc_eval.paper.flown import Maps, Track, fly_textured, limit_threads, map_flight, masks
 from buildloc_eval.paper.methods import BRM
+from buildloc_eval.paper.netvlad import NETVLAD, Encoders, load_encoders
 from buildloc_eval.paper.plan import (
     FULL,
     QUICK,
@@ -38,6 +41,7 @@ from buildloc_eval.paper.plan import (
     ragged,
 )
 from buildloc_eval.paper.report import Chapter, boston, write
+from buildloc_eval.paper.retrieval import predict_netvlad
 from buildloc_eval.paper.sources import measure, read_boston
 from buildloc_eval.paper.stages import Area, Progress, Say, Search, predict, side_by_side
 from buildloc_eval.paper.store import Store
@@ -65,12 +69,18 @@ def make_ground(store: Store, flights: Sequence[PaperFlight], models: Models, se
         store.save("reference", (ragged(reference), measure(reference)))
 
 
-def make_maps(flight: PaperFlight, track: Track, real: tuple[Any, ...], models: Models, seed: int) -> Maps:
-    """Draw what is flown over and what the segmenter makes of it, and map it."""
-    limit_threads()
+def draw_masks(
+    flight: PaperFlight, track: Track, real: tuple[Any, ...], models: Models, seed: int
+) -> Iterator[Mask]:
+    """Draw what is flown over and what the segmenter makes of it: the same masks for the same seed."""
     true = redrawn(outlines_of(real), models.digitiser, np.random.default_rng([seed, 7, flight.number]))
-    seen = masks(track, true, models.errors(flight), 1000 * seed + flight.number)
-    return map_flight(track, seen, models.mapper)
+    return masks(track, true, models.errors(flight), 1000 * seed + flight.number)
+
+
+def make_maps(flight: PaperFlight, track: Track, real: tuple[Any, ...], models: Models, seed: int) -> Maps:
+    """Map what the segmenter makes of a flight."""
+    limit_threads()
+    return map_flight(track, draw_masks(flight, track, real, models, seed), models.mapper)
 
 
 def fly_all(
@@ -131,14 +141,25 @@ def predict_brm(
             progress.step(maps_name(flight, s))
 
 
-def boston_part(out: Path, seed: int, quick: bool, models: Models, say: Say) -> Chapter:
+def boston_part(
+    out: Path, seed: int, quick: bool, models: Models, encoders: Encoders | None, say: Say
+) -> Chapter:
     """The paper's seven flights."""
     plan = QUICK if quick else FULL
     flights = [flight for flight in paper_flights() if flight.name in plan.flights]
-    stores = Stores(out, seed, models)
+    stores = Stores(out, seed, models, networks=encoders.digest if encoders else None)
     make_ground(stores.ground, flights, models, seed, say)
     fly_all(stores, flights, plan, models, seed, say)
     predict_all(stores, flights, plan, seed, say)
+    if encoders:
+
+        def seen_by(flight: PaperFlight, s: int) -> Iterator[Mask]:
+            track, real = (store.load(flight.name) for store in (stores.tracks, stores.ground))
+            return draw_masks(flight, track, real, models, s)
+
+        kept, _ = stores.ground.load("reference")
+        predict_netvlad(stores, flights, plan, seed, outlines_of(kept), encoders, seen_by, say)
+        plan = replace(plan, methods=(NETVLAD, *plan.methods))
     return boston(out, stores, flights, plan, models, seed)
 
 
@@ -174,16 +195,19 @@ def evaluate(
     say: Say,
     parts: Sequence[str] = PARTS,
     networks: Mapping[str, str] | None = None,
+    netvlad: Path | None = None,
 ) -> str:
     """Run what is not there yet of some parts, score it, write report.json and report.html; the summary.
 
-    ``networks``: ONNX files by the place of real imagery that they are for. Raises StaleError when the folder
-    holds results of another configuration or code, EvaluationError for a network that knows its ground.
+    ``networks``: ONNX files by the place of real imagery that they are for. ``netvlad``: folder of that
+    method's networks; it is left out without. Raises StaleError when the folder holds results of another
+    configuration or code, EvaluationError for a network that knows its ground, NetVladError.
     """
     models, started = measured_models(), time.perf_counter()
+    encoders = load_encoders(netvlad) if netvlad else None
     out.mkdir(parents=True, exist_ok=True)
     made: dict[str, Callable[[], Chapter]] = {
-        "boston": partial(boston_part, out, seed, quick, models, say),
+        "boston": partial(boston_part, out, seed, quick, models, encoders, say),
         "tokyo": partial(tokyo_part, out, seed, quick, models, say),
         "real": partial(real_part, out, seed, quick, models, networks or {}, say),
     }

@@ -74,17 +74,17 @@ class Grid:
 
 def load_encoders(folder: Path) -> Encoders:
     """The networks of a folder that `training/netvlad.py` wrote. Raises NetVladError."""
-    digest, found = hashlib.sha256(), list[Encode]()
+    digest, found = hashlib.sha256(), dict[str, Encode]()
     for name in BRANCHES:
         path = folder / f"{name}.onnx"
         if not path.is_file():
             raise NetVladError(f"{path}: no such network; make it with training/netvlad.py --out {folder}")
         digest.update(path.read_bytes())
         try:
-            found.append(_encoder(onnxruntime.InferenceSession(path, providers=_providers())))
+            found[name] = _encoder(onnxruntime.InferenceSession(path, providers=_providers()))
         except Exception as error:  # onnxruntime has no base class for its errors
             raise NetVladError(f"{path}: is not a loadable ONNX network; export it again") from error
-    return Encoders(*found, digest.hexdigest())
+    return Encoders(found["drone"], found["reference"], digest.hexdigest())
 
 
 def _providers() -> list[str]:

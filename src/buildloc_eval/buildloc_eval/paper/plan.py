@@ -17,6 +17,7 @@ from buildloc_eval.observation import Digitiser
 from buildloc_eval.paper.differences import AutomaticMapping
 from buildloc_eval.paper.flights import Flight, PaperFlight
 from buildloc_eval.paper.methods import METHODS
+from buildloc_eval.paper.netvlad import NETVLAD
 from buildloc_eval.paper.published import LARGE_RADII_KM, RADII_KM
 from buildloc_eval.paper.store import Store
 from buildloc_eval.sections import source_digest
@@ -33,6 +34,7 @@ MAP_CODE = (*TRACK_CODE, *GROUND_CODE, f"{PAPER}.brm", "buildloc_eval.segmentati
 PREDICTION_CODE = (
     *MAP_CODE, "buildloc_matcher", "buildloc_eval.generators", f"{PAPER}.methods"
 )  # fmt: skip
+NETVLAD_CODE = (*MAP_CODE, f"{PAPER}.methods", f"{PAPER}.netvlad", f"{PAPER}.retrieval")
 
 
 @dataclass(frozen=True)
@@ -95,12 +97,14 @@ def measured_models() -> Models:
 class Stores:
     """One folder per stage. Each is refused when an earlier stage's configuration or code has changed.
 
-    ``also`` and ``code``: what a part depends on besides, and its own modules.
+    ``also`` and ``code``: what a part depends on besides, and its own modules. ``networks``: digest of
+    NetVLAD's, whose predictions have a folder of their own.
     """
 
     def __init__(
-        self, out: Path, seed: int, models: Models, also: Mapping[str, Any] = {}, code: Sequence[str] = ()
-    ) -> None:
+        self, out: Path, seed: int, models: Models, also: Mapping[str, Any] = {}, code: Sequence[str] = (),
+        networks: str | None = None,
+    ) -> None:  # fmt: skip
         said = {name: value for name, value in asdict(models).items() if name != "mapper"}
         ground = {
             "seed": seed,
@@ -116,6 +120,12 @@ class Stores:
         self.maps = Store(out / "maps", _plain(maps | {"code": source_digest((*MAP_CODE, *code))}))
         predictions = maps | {"matchers": matchers, "code": source_digest((*PREDICTION_CODE, *code))}
         self.predictions = Store(out / "predictions", _plain(predictions))
+        retrieval = maps | {"networks": networks, "code": source_digest((*NETVLAD_CODE, *code))}
+        self._netvlad = None if networks is None else Store(out / "netvlad", _plain(retrieval))
+
+    def of(self, method: str) -> Store:
+        """Where a method's predictions are kept."""
+        return self._netvlad if method == NETVLAD and self._netvlad is not None else self.predictions
 
 
 def _plain(values: dict[str, Any]) -> dict[str, Any]:

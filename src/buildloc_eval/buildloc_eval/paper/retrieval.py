@@ -1,0 +1,137 @@
+"""Flights located by NetVLAD: their keyframes as tiles, and the predictions of every radius.
+
+This method alone is given the heading: the true one, as a compass without error would tell it.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import shapely
+from buildloc_msgs_py.types import FloatArray, Mask
+
+from buildloc_eval.paper.brm import Survivors, used_keyframes
+from buildloc_eval.paper.flights import PaperFlight
+from buildloc_eval.paper.flown import Maps, Track
+from buildloc_eval.paper.methods import LISTED, Prediction, nothing
+from buildloc_eval.paper.netvlad import (
+    NETVLAD,
+    Descriptors,
+    Encoders,
+    Grid,
+    Tiles,
+    accumulate,
+    distances,
+    keyframe_tile,
+)
+from buildloc_eval.paper.plan import Plan, Stores, maps_name, prediction_name
+from buildloc_eval.paper.scoring import BIN_M
+from buildloc_eval.paper.stages import Progress, Say
+from buildloc_eval.segmentation_errors import Outlines
+
+SeenBy = Callable[[PaperFlight, int], Iterable[Mask]]  # the masks of a flight and a seed
+
+
+@dataclass(frozen=True)
+class View:
+    """Keyframes of a flight: places (N, 2), metres east and north of anywhere, and tiles (N, 2, H, W)."""
+
+    path_m: FloatArray
+    tiles: Tiles
+
+
+def view(track: Track, maps: Maps, seen: Iterable[Mask]) -> View | None:
+    """The keyframes used of a whole flight, as the mapper's odometry places them; None where the last one
+    links to nothing."""
+    snapshot = maps.snapshots[-1]
+    if snapshot is None:
+        return None
+    path = np.array([[k.x_m, k.y_m] for k in snapshot.keyframes])
+    numbers, yaws = np.array(snapshot.numbers), np.array([k.yaw_rad for k in snapshot.keyframes])
+    north_up = float(np.angle(np.exp(1j * (maps.true_yaw_rad[numbers] - yaws)).mean()))
+    c, s = math.cos(north_up), math.sin(north_up)
+    used = used_keyframes(path)
+    wanted, tiles = set(numbers[used].tolist()), dict[int, Tiles]()
+    for number, (shot, mask) in enumerate(zip(track.shots, seen, strict=True)):
+        if number in wanted:
+            telemetry = (track.camera, shot.altitude_m, shot.attitude_xyzw)
+            tiles[number] = keyframe_tile(mask.pixels, *telemetry, float(maps.true_yaw_rad[number]))
+    return View(
+        path[used] @ np.array([[c, s], [-s, c]]), np.array([tiles[n] for n in numbers[used].tolist()])
+    )
+
+
+def prediction(
+    found: Survivors, seconds: dict[str, float], centre_m: FloatArray, radius_km: float
+) -> Prediction:
+    """The hypotheses that end within a radius, ranked; as with BRM, they do not depend on each other."""
+    places = found.ranked(centre_m, 1000.0 * radius_km)
+    inside = np.hypot(*(found.places_m - centre_m).T) <= 1000.0 * radius_km
+    order = np.argsort(found.residuals[inside], kind="stable")
+    bins = np.round(found.places_m[inside][order] / BIN_M).astype(np.int32)
+    _, first = np.unique(bins, axis=0, return_index=True)
+    return Prediction(
+        places, np.full_like(places, np.nan), None, bins[np.sort(first)[:LISTED]], None,
+        "NetVLAD has no measure of acceptance", seconds, {"hypotheses": float(inside.sum())},
+    )  # fmt: skip
+
+
+def locate(
+    views: Mapping[int, View], outlines: Outlines, grid: Grid, encoders: Encoders, step: Callable[[], None]
+) -> dict[int, tuple[Survivors, dict[str, float]]]:
+    """The hypotheses and the seconds of every seed's view. Tiles are described once for all of them."""
+    described, encoding_s = list[Descriptors](), list[float]()
+    for some in views.values():
+        started = time.perf_counter()
+        described.append(encoders.drone(some.tiles))
+        encoding_s.append(time.perf_counter() - started)
+    queries = np.concatenate(described)
+    apart, comparing_s = distances(outlines, grid, encoders.reference, queries, step)
+    found, first = dict[int, tuple[Survivors, dict[str, float]]](), 0
+    for (s, some), describing in zip(views.items(), encoding_s, strict=True):
+        started, count = time.perf_counter(), len(some.tiles)
+        hypotheses = accumulate(apart[first : first + count], some.path_m, grid)
+        search = comparing_s * count / len(apart) + time.perf_counter() - started
+        found[s] = hypotheses, {"describe": describing, "search": search}
+        first += count
+    return found
+
+
+def predict_netvlad(
+    stores: Stores, flights: Sequence[PaperFlight], plan: Plan, seed: int, reference: Outlines,
+    encoders: Encoders, seen_by: SeenBy, say: Say,
+) -> None:  # fmt: skip
+    """What is not there yet, all seeds of a flight at once."""
+    store, centroids = stores.of(NETVLAD), shapely.get_coordinates(shapely.centroid(reference))
+    for flight in flights:
+        asked = {
+            s: {
+                radius: prediction_name(NETVLAD, radius, flight, s, prefixes=False)
+                for radius in plan.radii_km
+            }
+            for s in range(seed, seed + plan.seeds)
+        }
+        left = [s for s, names in asked.items() if not all(store.has(name) for name in names.values())]
+        if not left:
+            continue
+        track, views = stores.tracks.load(flight.name), dict[int, View]()
+        for s in left:
+            seen = view(track, stores.maps.load(maps_name(flight, s)), seen_by(flight, s))
+            if seen is not None:
+                views[s] = seen
+                continue
+            for name in asked[s].values():
+                store.save(name, nothing("keyframe links to none of the latest keyframes"))
+        if not views:
+            continue
+        centre, radius_m = np.array(flight.centre_m), 1000.0 * max(plan.radii_km)
+        near, grid = np.hypot(*(centroids - centre).T) <= radius_m, Grid.about(centre, radius_m)
+        step = partial(Progress(say, NETVLAD, grid.count).step, flight.name)
+        for s, (hypotheses, seconds) in locate(views, reference[near], grid, encoders, step).items():
+            for radius, name in asked[s].items():
+                store.save(name, prediction(hypotheses, seconds, centre, radius))
