@@ -115,4 +115,4 @@ def test_live_equals_offline(offline: Path, database: Path, truth: Truth) -> Non
         apart = math.hypot(fix.easting_m - other.easting_m, fix.northing_m - other.northing_m)
         assert apart < 3.0 * math.sqrt(np.trace(other.covariance_enu_m2[:2, :2]) / 2.0)
         assert fix.yaw_rad == pytest.approx(other.yaw_rad, abs=NEAR_RAD)
-        assert fix.altitude_m == pytest.approx(other.altitude_m, abs=1.0)
+        assert fix.altitude_m == pytest.approx(other.altitude_m, abs=3.0)  # each of its own telemetry
