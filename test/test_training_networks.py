@@ -106,6 +106,7 @@ def test_the_papers_network_is_exported_and_runs(tmp_path: Path) -> None:
     assert np.isfinite(logits).all()
 
 
+@pytest.mark.slow
 def test_netvlads_branches_learn_and_export_what_they_learnt(tmp_path: Path) -> None:
     from netvlad import RADIUS_M, DualBranch, Ground, Training, draw_pairs, export
 

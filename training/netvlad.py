@@ -31,7 +31,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from train import EVERY, learning_rate
 
-# Circles of greater Boston (east, north; EPSG 32619), 10 km from the nearest flight.
+# Framingham and Ashland (east, north; EPSG 32619), 10 and 15 km from the nearest flight.
 TRAIN_M, HELD_OUT_M = (301_000.0, 4_685_000.0), (298_000.0, 4_679_000.0)
 RADIUS_M = 2500.0
 ERRORS_OF = "barnarp"  # as the flights have them
