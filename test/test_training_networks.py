@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -105,6 +106,7 @@ def test_the_papers_network_is_exported_and_runs(tmp_path: Path) -> None:
     assert np.isfinite(logits).all()
 
 
+@pytest.mark.slow
 def test_netvlads_branches_learn_and_export_what_they_learnt(tmp_path: Path) -> None:
     from netvlad import RADIUS_M, DualBranch, Ground, Training, draw_pairs, export
 
@@ -116,9 +118,9 @@ def test_netvlads_branches_learn_and_export_what_they_learnt(tmp_path: Path) -> 
     pairs = draw_pairs(ground, 12, rng)
     assert pairs.views.shape == (12, 2, 64, 64) and pairs.tiles.shape == (12, 1, 64, 64)
     assert not pairs.views[:, 0][pairs.views[:, 1] == 0.0].any()  # nothing is seen outside the frame
-    training = Training(DualBranch(), 40, torch.device("cpu"))
-    losses = [training.advance(pairs) for _ in range(16)]
-    assert max(losses[-3:]) < 0.7 * min(losses[:3])
+    training = Training(DualBranch(), 120, torch.device("cpu"))
+    losses = [math.prod(training.advance(draw_pairs(ground, 16, rng))) for _ in range(18)]  # of all triplets
+    assert np.mean(losses[-4:]) < 0.8 * np.mean(losses[:4])
     assert max(export(training.net, tmp_path, pairs).values()) < 1e-4
     sessions = [
         onnxruntime.InferenceSession(str(tmp_path / f"{name}.onnx")) for name in ("drone", "reference")
@@ -128,7 +130,7 @@ def test_netvlads_branches_learn_and_export_what_they_learnt(tmp_path: Path) -> 
     assert views.shape == tiles.shape == (12, 4096)
     np.testing.assert_allclose(np.linalg.norm(views, axis=1), 1.0, atol=1e-5)
     training.save(tmp_path / "checkpoint.pt", {"seed": 1})
-    resumed = Training(DualBranch(), 40, torch.device("cpu"))
+    resumed = Training(DualBranch(), 120, torch.device("cpu"))
     resumed.restore(tmp_path / "checkpoint.pt", {"seed": 1})
     np.testing.assert_allclose(resumed.advance(pairs), training.advance(pairs), atol=1e-5)
 

@@ -31,7 +31,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from train import EVERY, learning_rate
 
-# Circles of greater Boston (east, north; EPSG 32619), 10 km from the nearest flight.
+# Framingham and Ashland (east, north; EPSG 32619), 10 and 15 km from the nearest flight.
 TRAIN_M, HELD_OUT_M = (301_000.0, 4_685_000.0), (298_000.0, 4_679_000.0)
 RADIUS_M = 2500.0
 ERRORS_OF = "barnarp"  # as the flights have them
@@ -210,12 +210,14 @@ def _cut(plane: Tiles, place_m: np.ndarray) -> Tiles:
     return plane[row : row + SIDE_PX, column : column + SIDE_PX]
 
 
-def triplet_loss(views: Tensor, tiles: Tensor, places_m: Tensor) -> Tensor:
-    """Mean over the triplets of a batch that violate the margin: a view, its tile, another place's tile."""
+def triplet_loss(views: Tensor, tiles: Tensor, places_m: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean over the triplets of a batch that violate the margin (a view, its tile, another place's tile), and
+    their share of all triplets: the mean alone tells little of progress, as the easy ones drop out of it."""
     apart = 2.0 - 2.0 * views @ tiles.T
-    excess = functional.relu(apart.diagonal()[:, None] - apart + MARGIN)
-    excess = excess * (torch.cdist(places_m, places_m) > APART_M)
-    return excess.sum() / (excess > 0).sum().clamp(min=1)
+    others = torch.cdist(places_m, places_m) > APART_M
+    excess = functional.relu(apart.diagonal()[:, None] - apart + MARGIN) * others
+    violating = (excess > 0).sum()
+    return excess.sum() / violating.clamp(min=1), violating / others.sum().clamp(min=1)
 
 
 class Training:
@@ -226,21 +228,21 @@ class Training:
         self.optimiser = torch.optim.AdamW(net.parameters(), lr=0.0, weight_decay=1e-2)
         self.steps, self.step, self.seconds, self.device = steps, 0, 0.0, device
 
-    def advance(self, pairs: Pairs) -> float:
-        """One step; the loss before it."""
+    def advance(self, pairs: Pairs) -> tuple[float, float]:
+        """One step; the loss and the share of violating triplets before it."""
         self.net.train()
         for group in self.optimiser.param_groups:
             group["lr"] = 1e-3 * learning_rate(self.step, self.steps)
         given = [
             torch.from_numpy(a).float().to(self.device) for a in (pairs.views, pairs.tiles, pairs.places_m)
         ]
-        loss = triplet_loss(*self.net(*given[:2]), given[2])
+        loss, violating = triplet_loss(*self.net(*given[:2]), given[2])
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
         self.optimiser.step()
         self.step += 1
-        return float(loss.detach())
+        return float(loss.detach()), float(violating)
 
     def save(self, path: Path, settings: dict[str, object]) -> None:
         """Write the checkpoint; a run that is killed meanwhile keeps the earlier one."""
@@ -279,20 +281,22 @@ def train(training: Training, ground: Ground, batch: int, out: Path, settings: d
     """Run to the last step, logging and saving as it goes."""
     log = out / "log.csv"
     if training.step == 0 or not log.exists():
-        log.write_text("step,loss,seconds\n")
-    recent, started = list[float](), time.monotonic() - training.seconds
+        log.write_text("step,loss,violating,seconds\n")
+    recent, started = list[tuple[float, float]](), time.monotonic() - training.seconds
     while training.step < training.steps:
         rng = np.random.default_rng([int(str(settings["seed"])), 1, training.step])
         recent.append(training.advance(draw_pairs(ground, batch, rng)))
         training.seconds = time.monotonic() - started
         if training.step % EVERY == 0 or training.step == training.steps:
-            loss = sum(recent) / len(recent)
+            loss, violating = np.mean(recent, axis=0).tolist()
             recent.clear()
             with log.open("a") as lines:
-                lines.write(f"{training.step},{loss:.5g},{training.seconds:.5g}\n")
+                lines.write(f"{training.step},{loss:.5g},{violating:.5g},{training.seconds:.5g}\n")
             left = training.seconds / training.step * (training.steps - training.step)
             print(
-                f"step {training.step}/{training.steps} loss {loss:.4f}, {left / 60:.0f} min left", flush=True
+                f"step {training.step}/{training.steps} loss {loss:.4f}, "
+                f"{100.0 * violating:.0f} % of triplets, {left / 60:.0f} min left",
+                flush=True,
             )
         if training.step % STEPS_KEPT == 0 or training.step == training.steps:
             training.save(out / "checkpoint.pt", settings)

@@ -34,6 +34,7 @@ setup(
         "matplotlib>=3.6,<4",
         "scipy>=1.11,<2",
         "faiss-cpu>=1.8,<2",
+        "onnxruntime>=1.18,<2",
         "evo>=1.31,<2",
     ],
     extras_require={"ros": ["buildloc_msgs_py[ros]"], "test": ["pytest"]},

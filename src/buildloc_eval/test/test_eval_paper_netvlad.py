@@ -41,6 +41,7 @@ from numpy.testing import assert_allclose
 
 CENTRE = np.array([320_000.0, 4_690_000.0])
 CAMERA = CameraModel(480, 360, 300.0, 300.0, 239.5, 179.5)
+KEYFRAMES = 17
 ALTITUDE_M, TURN_RAD, YAW_RAD = 100.0, 0.7, 0.4  # of the map against north; of image-right from east
 ERRORS = SegmentationErrors(
     1, 0.1, 0.05, 0.05, 100.0, 0.2, 30.0, 0.5, 0.0, 0.2, (0.05, 0.05, 0.05, 0.05), 0.6, 1, 0.1, 0.2, 0.5
@@ -52,7 +53,9 @@ PLAN = Plan(("flight1",), 1, (1,), {}, 0)
 def town(seed: int = 1) -> np.ndarray:
     """Houses of many sizes, more of them here and fewer there."""
     rng = np.random.default_rng(seed)
-    places = CENTRE + rng.uniform(-1200.0, 1200.0, (2500, 2))
+    places = CENTRE + rng.uniform(-1200.0, 1200.0, (5000, 2))
+    block = np.floor((places - CENTRE + 1200.0) / 120.0).astype(int)
+    places = places[rng.random(5000) < rng.random((20, 20))[*block.T] ** 2]
     low = places - rng.uniform(5.0, 20.0, places.shape)
     return np.asarray(shapely.box(*low.T, *places.T))
 
@@ -60,7 +63,7 @@ def town(seed: int = 1) -> np.ndarray:
 def by_hand(tiles: np.ndarray) -> np.ndarray:
     """A descriptor without learning: the middle of the building plane, coarse, of length 1."""
     small = np.array([cv2.resize(tile[0], (16, 16), interpolation=cv2.INTER_AREA) for tile in tiles])
-    flat = np.array([cv2.GaussianBlur(one, (0, 0), 2.0)[4:12, 4:12] for one in small]).reshape(len(tiles), -1)
+    flat = np.array([cv2.GaussianBlur(one, (0, 0), 3.0)[4:12, 4:12] for one in small]).reshape(len(tiles), -1)
     return np.asarray(flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-9), dtype=np.float32)
 
 
@@ -90,18 +93,30 @@ def outlines() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def flown(outlines: np.ndarray) -> tuple[Track, Maps, list[Mask]]:
-    """A faultless flight to the north east through CENTRE; its map is turned by TURN_RAD."""
-    true = CENTRE + np.linspace(-180.0, 180.0, 9)[:, None] * (0.8, 0.6)
+    """A faultless flight to the north east between the tiles; its map is turned by TURN_RAD."""
+    true = CENTRE + [17.0, -21.0] + np.linspace(-480.0, 480.0, KEYFRAMES)[:, None] * (0.8, 0.6)
     c, s = math.cos(TURN_RAD), math.sin(TURN_RAD)
     poses = (true - CENTRE) @ np.array([[c, s], [-s, c]])
     frames = tuple(Keyframe(n + 1, *xy, TURN_RAD + YAW_RAD) for n, xy in enumerate(poses.tolist()))
     nothing = LocalMap.whole(
-        9, np.empty(0, np.int64), np.empty((0, 2)), np.empty(0), np.empty((0, 4)), np.empty(0, np.int64)
+        KEYFRAMES,
+        np.empty(0, np.int64),
+        np.empty((0, 2)),
+        np.empty(0),
+        np.empty((0, 4)),
+        np.empty(0, np.int64),
     )
-    last = Snapshot(nothing, frames, tuple(range(9)))
-    maps = Maps((*(None,) * 8, last), (), (1.0, 2.0, 3.0), np.empty((9, 3)), true, np.full(9, YAW_RAD))
+    last = Snapshot(nothing, frames, tuple(range(KEYFRAMES)))
+    maps = Maps(
+        (*(None,) * (KEYFRAMES - 1), last),
+        (),
+        (1.0, 2.0, 3.0),
+        np.empty((KEYFRAMES, 3)),
+        true,
+        np.full(KEYFRAMES, YAW_RAD),
+    )
     taken = shots(true)
-    return Track(CAMERA, taken, (None,) * 9), maps, [mask(outlines, shot) for shot in taken]
+    return Track(CAMERA, taken, (None,) * KEYFRAMES), maps, [mask(outlines, shot) for shot in taken]
 
 
 def test_a_raster_has_the_area_and_the_place_of_a_building() -> None:
@@ -111,10 +126,10 @@ def test_a_raster_has_the_area_and_the_place_of_a_building() -> None:
 
 
 def test_a_keyframe_is_turned_north_up(outlines: np.ndarray, flown: tuple[Track, Maps, list[Mask]]) -> None:
-    track, _, masks = flown
-    tile = keyframe_tile(masks[4].pixels, CAMERA, ALTITUDE_M, track.shots[4].attitude_xyzw, YAW_RAD)
+    track, maps, masks = flown
+    tile = keyframe_tile(masks[8].pixels, CAMERA, ALTITUDE_M, track.shots[8].attitude_xyzw, YAW_RAD)
     half = SIDE_PX * PIXEL_M / 2.0
-    drawn = raster(outlines, *(CENTRE - half).tolist(), (SIDE_PX, SIDE_PX))
+    drawn = raster(outlines, *(maps.true_m[8] - half).tolist(), (SIDE_PX, SIDE_PX))
     shown = tile[1] > 0.99
     assert 0.5 < shown.mean() < 1.0  # 160 x 120 m, turned: corners of the tile are not seen
     flipped = [drawn[::-1], drawn[:, ::-1], drawn[::-1, ::-1], drawn.T]
@@ -124,8 +139,9 @@ def test_a_keyframe_is_turned_north_up(outlines: np.ndarray, flown: tuple[Track,
 
 
 def test_tiles_of_a_grid_lie_about_their_places(outlines: np.ndarray) -> None:
-    grid = Grid.about(CENTRE, 120.0)
-    assert grid.count == 5 and grid.inside.sum() == 21 and not grid.inside[0, 0]
+    grid = Grid.about(CENTRE + np.array([9.0, -17.0]), 120.0)
+    assert (grid.west_m % STEP_M, grid.south_m % STEP_M) == (0.0, 0.0)  # wherever the circle lies
+    assert grid.inside.sum(axis=1).tolist() == [3, 5, 5, 4, 1]
     half = SIDE_PX * PIXEL_M / 2.0
     for row, columns, tiles in tile_rows(outlines, grid):
         for column, tile in zip(columns.tolist(), tiles, strict=True):
@@ -183,7 +199,7 @@ def test_a_flight_is_found_kept_and_not_made_again(
     (kept,) = stores.of(NETVLAD).folder.glob("*.pickle")
     found = stores.of(NETVLAD).load(kept.stem)
     assert not stores.predictions.has(kept.stem)
-    assert score(found, maps, 9, 1.0).rank == score(found, maps, 9, 1.0).bin_rank == 1
+    assert score(found, maps, KEYFRAMES, 1.0).rank == score(found, maps, KEYFRAMES, 1.0).bin_rank == 1
     assert 2 <= len(found.places_m) <= 10 and np.hypot(*(found.places_m[1] - found.places_m[0])) > 100.0
     assert found.refused and set(found.seconds) == {"describe", "search"}
     assert "100 %" in said[-1]

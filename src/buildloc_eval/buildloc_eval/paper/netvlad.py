@@ -65,11 +65,13 @@ class Grid:
 
     @classmethod
     def about(cls, centre_m: FloatArray, radius_m: float) -> Grid:
-        """Tiles within a circle."""
-        steps = STEP_M * np.arange(-math.floor(radius_m / STEP_M), math.floor(radius_m / STEP_M) + 1)
-        inside = np.hypot(steps[:, None], steps[None, :]) <= radius_m
-        west, south = (centre_m + steps[0]).tolist()
-        return cls(west, south, len(steps), inside)
+        """Tiles within a circle. They lie at whole multiples of STEP_M: were they laid about the circle, a
+        flight about its centre would lie on them better than by chance."""
+        west, south = np.ceil((centre_m - radius_m) / STEP_M) * STEP_M
+        steps = STEP_M * np.arange(math.floor(2.0 * radius_m / STEP_M) + 1)
+        east_m, north_m = west + steps - centre_m[0], south + steps - centre_m[1]
+        inside = np.hypot(east_m[None, :], north_m[:, None]) <= radius_m
+        return cls(float(west), float(south), len(steps), inside)
 
 
 def load_encoders(folder: Path) -> Encoders:
