@@ -149,7 +149,11 @@ def test_a_network_is_not_flown_over_ground_that_it_knows() -> None:
         real.networks(real.FLIGHTS, {"atlantis": str(shipped)})
 
 
-def test_real_imagery_goes_through_registration_network_and_mapper() -> None:
+def test_real_imagery_goes_through_registration_network_and_mapper(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "footprints").mkdir()  # the flight's ground is made up: no data is read
+    monkeypatch.setenv("BUILDLOC_DATA", str(tmp_path))
     network = real.network_for("barnarp", "")
     moved = SITE - np.array([240.0, 200.0])
     seen = real.see(FLIGHT, moved, network, MODELS, 1)
