@@ -265,8 +265,8 @@ class Matcher:
         latitude, longitude = self.database.to_wgs84(place.x_m, place.y_m)
         covariance = covariance_enu(place.covariance, self.config)
         return Fix(
-            place.stamp_ns, latitude, longitude, altitude_m, place.x_m, place.y_m, float(wrap(place.yaw_rad)), covariance,
-            float(place.covariance[2, 2]),
+            place.stamp_ns, latitude, longitude, altitude_m, place.x_m, place.y_m,
+            float(wrap(place.yaw_rad)), covariance, float(place.covariance[2, 2]),
         )  # fmt: skip
 
     def follow(
