@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
+import shapely
 from augment import augmented, coarse, colours, snow
 from buildloc_eval.places import Scene
-from crops import CROP_PX, CropConfig, CropSampler, core
-from rendered import decoys, rectangle, render
+from crops import CROP_PX, ONE_HOUSE_M2, CropConfig, CropSampler, core
+from rendered import Canvas, block, decoys, rectangle, render
 
 PLAIN = CropConfig(rendered_share=0.0, decoy_share=0.0)
 
@@ -111,8 +114,33 @@ def test_labels_follow_the_picture_at_any_scale_heading_and_tilt(monkeypatch: py
 def test_ground_outside_the_scene_has_no_weight() -> None:
     small = white_roofs(0.2).part(slice(0, 150), slice(0, 150), "corner")
     weight = CropSampler([small], PLAIN, seed=1).batch(0, 4)[2]
-    assert weight.shape == (4, 1, CROP_PX, CROP_PX)
+    assert weight.shape == (4, 2, CROP_PX, CROP_PX)
+    assert np.array_equal(weight[:, 0], weight[:, 1])
     assert 0.05 < weight.mean() < 0.9
+
+
+def test_where_large_buildings_of_a_mask_are_cut_apart_nobody_knows() -> None:
+    scene = replace(white_roofs(0.2), told_apart=False)
+    areas = np.bincount(scene.buildings.ravel()) * 0.2**2
+    small = Scene(
+        "small", 0.2, scene.rgb, np.where(areas[scene.buildings] <= ONE_HOUSE_M2, scene.buildings, 0),
+        scene.labelled, told_apart=False,
+    )  # fmt: skip
+    for town, some_unknown in ((scene, True), (small, False)):
+        _, target, weight = CropSampler([town], PLAIN, seed=1).batch(0, 4)
+        unknown = weight[:, 1] < weight[:, 0]
+        assert unknown.any() == some_unknown
+        assert (target[:, 0][unknown] == 1.0).all()  # the ground is known
+
+
+def test_houses_of_a_block_touch_and_do_not_overlap() -> None:
+    canvas = Canvas(256, 0.2, np.random.default_rng(3))
+    plans = block(canvas, 0.4)
+    outlines = [shapely.Polygon(rectangle(*plan)) for plan in plans]
+    for k, outline in enumerate(outlines):
+        others = outlines[:k] + outlines[k + 1 :]
+        assert min(outline.distance(other) for other in others) < 1e-6
+        assert max(outline.intersection(other).area for other in others) < 1e-6
 
 
 def test_a_batch_depends_on_seed_and_step_alone_so_that_a_run_resumes() -> None:

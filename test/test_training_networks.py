@@ -81,6 +81,26 @@ def test_a_run_resumes_where_it_was_and_refuses_other_settings(tmp_path: Path) -
 
 
 @pytest.mark.slow
+def test_a_run_goes_on_from_an_exported_network(tmp_path: Path) -> None:
+    from export import parity, write_onnx
+    from networks import folded, network, take_weights
+    from train import started_from
+
+    training, _ = trained("lite0", 3)
+    path = tmp_path / "model.onnx"
+    write_onnx(training.average, path, {"places": ["squares"], "steps": 3})
+    assert started_from(path, ["squares", "circles"]) == {"places": ["squares"], "steps": 3}
+    with pytest.raises(SystemExit, match="squares too"):
+        started_from(path, ["circles"])
+    net = network("lite0")
+    take_weights(folded(net), path)
+    assert parity(net, path, batch(99)[0].numpy())["max_difference"] < 1e-3
+    write_onnx(torch.nn.Conv2d(3, 2, 3), tmp_path / "other.onnx", {"places": []})
+    with pytest.raises(SystemExit, match=r"other.onnx: is not an export of this network"):
+        take_weights(net, tmp_path / "other.onnx")
+
+
+@pytest.mark.slow
 def test_int8_says_nearly_the_same(tmp_path: Path) -> None:
     from export import agreement, quantise, write_onnx
 

@@ -18,6 +18,7 @@ FINEST_GSD_M = 0.12  # scenes are kept no finer than this
 CROP_PX = 256
 CORE_M = 0.6  # the core of a building is what lies deeper inside it than this
 RENDERED_SIDE_PX = 448
+ONE_HOUSE_M2 = 200.0  # what a mask shows as one building, and is larger, may be several
 
 
 @dataclass(frozen=True)
@@ -65,18 +66,19 @@ class CropSampler:
         # Large places count more than small ones, but not by their area: variety matters.
         area = np.array([scene.labelled.sum() * scene.gsd_m**2 for scene in self._real]) ** 0.6
         self._odds = area / area.sum()
+        self._one_house = [_one_house(scene) for scene in self._real]
         self._inside = [np.argwhere(scene.labelled[::16, ::16]) * 16 for scene in self._real]
         self._rendered = rendered_scenes(config.rendered_scenes, seed) if config.rendered_share > 0.0 else []
 
     def batch(self, step: int, count: int, done: float = 0.0) -> tuple[Image, Image, Image]:
-        """A step's batch: RGB 0-255 (n, 3, h, w), building and core (n, 2, h, w), weight (n, 1, h, w).
+        """A step's batch: RGB 0-255 (n, 3, h, w), building and core (n, 2, h, w), their weights (n, 2, h, w).
 
         ``done`` is the share of the run that lies behind.
         """
         rng = np.random.default_rng((self._seed, step))
         strength = self._config.closing_strength if done >= 1.0 - self._config.closing else 1.0
         rgb, target, weight = zip(*(self._crop(strength, rng) for _ in range(count)), strict=True)
-        return np.stack(rgb), np.stack(target), np.stack(weight)[:, None]
+        return np.stack(rgb), np.stack(target), np.stack(weight)
 
     def _crop(self, strength: float, rng: np.random.Generator) -> tuple[Image, Image, Image]:
         config = self._config
@@ -94,8 +96,21 @@ class CropSampler:
         if not is_rendered and rng.random() < config.decoy_share * strength:
             rgb = decoys(rgb, labels, TRAIN_GSD_M, rng)
         rgb = augmented(rgb, labels, TRAIN_GSD_M, strength, rng)
+        split_known = known if is_rendered else known & self._one_house[which][labels]
         target = np.stack([labels > 0, core(labels, TRAIN_GSD_M)]).astype(np.float32)
-        return np.ascontiguousarray(rgb.transpose(2, 0, 1)), target, known.astype(np.float32)
+        return (
+            np.ascontiguousarray(rgb.transpose(2, 0, 1)),
+            target,
+            np.stack([known, split_known]).astype(np.float32),
+        )
+
+
+def _one_house(scene: Scene) -> NDArray[np.bool_]:
+    """Of each label, ground (0) too, whether it is known where its building ends and the next one begins."""
+    areas = np.bincount(scene.buildings.ravel()) * scene.gsd_m**2
+    known = scene.told_apart | (areas <= ONE_HOUSE_M2)
+    known[0] = True
+    return known
 
 
 def _warp(

@@ -21,7 +21,7 @@ import onnxruntime
 import torch
 from buildloc_eval.places import place
 from crops import TRAIN_GSD_M, CropConfig, CropSampler
-from networks import CHANNELS, BuildingNet, SegFormer, network
+from networks import CHANNELS, BuildingNet, SegFormer, folded, network
 from numpy.typing import NDArray
 from onnxruntime.quantization import (
     CalibrationDataReader,
@@ -114,6 +114,8 @@ def load(folder: Path) -> tuple[BuildingNet | SegFormer, dict[str, object]]:
         raise SystemExit(f"{path}: no such checkpoint; run training/train.py --out {folder} first")
     state = torch.load(path, map_location="cpu", weights_only=True)
     net = network(state["settings"]["network"])
+    if "start" in state["settings"]:
+        folded(net)
     net.load_state_dict(state["average"])
     return net.eval(), {
         **state["settings"],

@@ -4,7 +4,9 @@ building, and core (deep inside its own building)."""
 from __future__ import annotations
 
 from importlib import import_module
+from pathlib import Path
 
+import onnx
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -119,6 +121,33 @@ class SegFormer(nn.Module):
         """RGB 0-255 (n, 3, h, w) -> logits (n, 2, h/4, w/4); h and w multiples of 32."""
         logits: Tensor = self.net(pixel_values=(rgb - self.mean) / self.std, return_dict=True).logits
         return logits
+
+
+def folded(net: nn.Module) -> nn.Module:
+    """The network as it is exported: every batch normalisation folded away, every convolution with a bias."""
+    for name, child in net.named_children():
+        if isinstance(child, nn.BatchNorm2d):
+            setattr(net, name, nn.Identity())
+        elif isinstance(child, nn.Conv2d) and child.bias is None:
+            child.bias = nn.Parameter(torch.zeros(child.out_channels))
+        else:
+            folded(child)
+    return net
+
+
+def take_weights(net: nn.Module, path: Path) -> None:
+    """Give a folded network the weights of an exported one. Raises SystemExit for one of another kind."""
+    graph = onnx.load(str(path)).graph
+    stored = {
+        tensor.name: torch.from_numpy(onnx.numpy_helper.to_array(tensor).copy())
+        for tensor in graph.initializer
+    }
+    theirs = [[stored[name] for name in node.input[1:]] for node in graph.node if node.op_type == "Conv"]
+    ours = [layer for layer in net.modules() if isinstance(layer, nn.Conv2d)]
+    if [layer.weight.shape for layer in ours] != [weights[0].shape for weights in theirs]:
+        raise SystemExit(f"{path}: is not an export of this network; choose a float32 model.onnx of lite0")
+    for layer, (weight, bias) in zip(ours, theirs, strict=True):
+        layer.load_state_dict({"weight": weight, "bias": bias})
 
 
 def network(name: str, pretrained: str | None = None) -> BuildingNet | SegFormer:

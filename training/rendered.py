@@ -289,8 +289,10 @@ def building(canvas: Canvas, number: int, centre: Points, length: float, width: 
         )
     masks = [_inside(canvas.labels.shape, rectangle(*wing)) for wing in wings]
     footprint = np.logical_or.reduce(masks)
-    if not footprint.any() or (canvas.labels[footprint] > 0).mean() > 0.02:
+    taken = canvas.labels > 0
+    if not footprint.any() or taken[footprint].mean() > 0.1:  # pixels that touching houses share
         return False
+    footprint &= ~taken
     height = rng.uniform(2.5, 9.0) / canvas.gsd
     wall = canvas.paving() * rng.uniform(0.8, 1.6)
     for wing in wings:
@@ -299,9 +301,6 @@ def building(canvas: Canvas, number: int, centre: Points, length: float, width: 
         foot = rectangle(*wing)
         hull = cv2.convexHull(np.vstack([foot, foot + canvas.light.lean * height]).astype(np.float32))[:, 0]
         canvas.paint(hull.astype(np.float64), wall, 4.0)
-    colour = ROOFS[rng.integers(len(ROOFS))] * rng.uniform(0.7, 1.25) + rng.uniform(-12, 12, 3).astype(
-        np.float32
-    )
     kind = str(rng.choice(("gable", "hip", "flat", "shed"), p=(0.45, 0.2, 0.25, 0.1)))
     stripes, amplitude = rng.uniform(0.25, 1.2) / canvas.gsd, rng.uniform(0.0, 0.12)
     contrast = rng.uniform(0.2, 1.2) * (1.0 - canvas.light.shade)
@@ -312,7 +311,7 @@ def building(canvas: Canvas, number: int, centre: Points, length: float, width: 
             colour = _roof_colour(rng)
         t = np.array([[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]])
         for face, downhill in _roof_faces(long, wide, kind):
-            where = _inside(canvas.labels.shape, at + face @ t.T) & mask
+            where = _inside(canvas.labels.shape, at + face @ t.T) & mask & ~taken
             lit = max(0.3, 1.0 - contrast * float((t @ downhill) @ canvas.light.away))
             along = columns[where] * math.cos(a) + rows[where] * math.sin(a)
             ribs = 1.0 + amplitude * np.sin(along * (math.tau / max(stripes, 2.2)))
@@ -355,6 +354,22 @@ def annexes(canvas: Canvas, centre: Points, length: float, width: float, angle: 
             canvas.car(at, angle + rng.choice((0.0, math.pi / 2.0)))
 
 
+def block(canvas: Canvas, angle: float) -> list[tuple[Points, float, float, float]]:
+    """A block of a dense town: two rows of houses that touch, back to back. Centre, length, width, angle."""
+    rng = canvas.rng
+    along = np.array([math.cos(angle), math.sin(angle)])
+    across = np.array([-along[1], along[0]])
+    corner, depth, plans = canvas.place(), canvas.px(6.0, 14.0), []
+    for side in (-1.0, 1.0):
+        front = -canvas.px(0.0, 4.0)
+        for _ in range(rng.integers(3, 9)):
+            length, width = canvas.px(4.0, 11.0), depth * rng.uniform(0.7, 1.0)
+            centre = corner + along * (front + length / 2.0) + across * side * width / 2.0
+            plans.append((centre, length, width, angle))
+            front += length
+    return plans
+
+
 def render(side_px: int, gsd_m: float, rng: np.random.Generator) -> tuple[Image, Labels]:
     """A square of a town nobody knows: RGB (side, side, 3) 0-255 and labels (side, side)."""
     canvas = Canvas(side_px, gsd_m, rng)
@@ -368,7 +383,7 @@ def render(side_px: int, gsd_m: float, rng: np.random.Generator) -> tuple[Image,
         canvas.road(canvas.place(), angle + rng.choice((0.0, math.pi / 2.0)) + rng.normal(0.0, 0.1))
     for _ in range(rng.integers(0, 3)):
         canvas.car_park(canvas.place(), angle)
-    dense = rng.random() < 0.25
+    dense = rng.random() < 0.35
     count, number = int(rng.integers(4, 26) if dense else rng.integers(0, 9)), 0
     plans = []
     while len(plans) < count:
@@ -381,6 +396,8 @@ def render(side_px: int, gsd_m: float, rng: np.random.Generator) -> tuple[Image,
         plans += [(at + step * k, length, width * rng.uniform(0.85, 1.15), own) for k in range(row)]
     for plan in plans:
         annexes(canvas, *plan)
+    for _ in range(rng.integers(1, 6) if dense else 0):
+        plans += block(canvas, angle + rng.choice((0.0, math.pi / 2.0)) + rng.normal(0.0, 0.05))
     for thing, most in ((canvas.pool, 3), (canvas.hedge, 6), (canvas.terrace, 3)):
         for _ in range(rng.integers(0, most)):
             thing(canvas.place(), angle + rng.choice((0.0, math.pi / 2.0)))

@@ -15,26 +15,28 @@ import time
 from pathlib import Path
 
 import cv2
+import onnx
 import torch
 from buildloc_eval.places import PLACES, Scene, place
 from crops import CropConfig, CropSampler
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from networks import BuildingNet, SegFormer, network
+from networks import BuildingNet, SegFormer, folded, network, take_weights
 from torch import Tensor, nn
 from torch.nn import functional
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+STARTED_RATE = 0.3  # peak learning rate of weights that are trained already, over that of fresh ones
 COLUMNS = ("step", "loss", "building", "core", "learning_rate", "seconds")
 EVERY = 25
 
 
 def segmentation_loss(logits: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-    """Cross-entropy plus dice of each channel (2,), over the pixels that have a weight."""
+    """Cross-entropy plus dice of each channel (2,), over the pixels that have a weight in it."""
     logits = functional.interpolate(logits, size=target.shape[2:], mode="bilinear", align_corners=False)
     entropy = functional.binary_cross_entropy_with_logits(logits, target, reduction="none")
     axes = (0, 2, 3)
-    total = weight.sum().clamp(min=1.0)
+    total = weight.sum(axes).clamp(min=1.0)
     probability, truth = torch.sigmoid(logits) * weight, target * weight
     overlap = 2.0 * (probability * truth).sum(axes) + 1.0
     dice = 1.0 - overlap / (probability.sum(axes) + truth.sum(axes) + 1.0)
@@ -60,7 +62,9 @@ def learning_rate(step: int, steps: int) -> float:
 class Training:
     """Everything that a checkpoint holds."""
 
-    def __init__(self, net: BuildingNet | SegFormer, steps: int, device: torch.device) -> None:
+    def __init__(
+        self, net: BuildingNet | SegFormer, steps: int, device: torch.device, rate: float = 1.0
+    ) -> None:
         self.net = net.to(device, memory_format=torch.channels_last)
         self.average = copy.deepcopy(self.net)
         gentle = {id(p) for p in net.pretrained_parameters()}
@@ -70,7 +74,7 @@ class Training:
             weight_decay=2e-2,
         )
         self.steps, self.step, self.seconds, self.device = steps, 0, 0.0, device
-        self.peaks = [float(group["lr"]) for group in self.optimiser.param_groups]
+        self.peaks = [rate * float(group["lr"]) for group in self.optimiser.param_groups]
 
     def advance(self, rgb: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, float]:
         """One step: the loss of each channel before it, and the learning rate's factor."""
@@ -174,6 +178,18 @@ def scenes_of(places: list[str], imagery: Path) -> list[Scene]:
     return [scene for name in places for scene in place(imagery, name)]
 
 
+def started_from(model: Path, places: list[str]) -> dict[str, object]:
+    """How an exported network was trained. Raises SystemExit where it saw more ground than ``places``."""
+    notes = {entry.key: entry.value for entry in onnx.load(str(model)).metadata_props}
+    training: dict[str, object] = json.loads(notes.get("buildloc_training", "{}"))
+    seen = training.get("places")
+    if not isinstance(seen, list):
+        raise SystemExit(f"{model}: does not say what trained it; start from a file of training/export.py")
+    if missing := sorted(set(seen) - set(places)):
+        raise SystemExit(f"{model}: has seen {', '.join(missing)} too; add that to --places")
+    return training
+
+
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(
@@ -182,6 +198,9 @@ def main() -> None:
     parser.add_argument("--places", nargs="+", required=True, help="ground that trains; all else is held out")
     parser.add_argument("--network", default="lite0", help="lite0, or segformer-b0 to segformer-b5")
     parser.add_argument("--pretrained", help="folder of pretrained SegFormer weights")
+    parser.add_argument(
+        "--start", type=Path, help="exported float32 network (lite0) whose weights to go on from"
+    )
     parser.add_argument("--steps", type=int, default=1800)
     parser.add_argument("--batch", type=int, default=8)
     parser.add_argument("--seed", type=int, default=1)
@@ -198,9 +217,13 @@ def main() -> None:
         "places": args.places, "network": args.network, "steps": args.steps, "batch": args.batch,
         "seed": args.seed,
     }  # fmt: skip
+    net = network(args.network, args.pretrained)
+    if args.start:
+        settings["start"] = started_from(args.start, args.places)
+        take_weights(folded(net), args.start)
+    training = Training(net, args.steps, device, STARTED_RATE if args.start else 1.0)
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / "settings.json").write_text(json.dumps(settings, indent=2) + "\n")
-    training = Training(network(args.network, args.pretrained), args.steps, device)
     if (args.out / "checkpoint.pt").exists():
         training.restore(args.out / "checkpoint.pt", settings)
         print(f"going on from step {training.step}")

@@ -36,13 +36,15 @@ class PlaceError(BuildlocError):
 @dataclass(frozen=True)
 class Scene:
     """A north-up picture with its labels, all (H, W): the building of each pixel, 0 for none, and whether the
-    pixel is labelled at all. Unlabelled pixels neither train nor count."""
+    pixel is labelled at all. Unlabelled pixels neither train nor count. ``told_apart``: touching buildings
+    have labels of their own; where they came as a mask, they are one."""
 
     name: str
     gsd_m: float
     rgb: ByteArray
     buildings: Labels
     labelled: BoolArray
+    told_apart: bool = True
 
     def part(self, rows: slice, columns: slice, name: str) -> Scene:
         """A rectangular part."""
@@ -60,7 +62,10 @@ class Scene:
         rows = np.minimum((np.arange(height) + 0.5) / zoom, self.labelled.shape[0] - 1).astype(int)
         columns = np.minimum((np.arange(width) + 0.5) / zoom, self.labelled.shape[1] - 1).astype(int)
         at = np.ix_(rows, columns)
-        return Scene(self.name, gsd_m, rgb.astype(np.uint8), self.buildings[at], self.labelled[at])
+        return replace(
+            self, gsd_m=gsd_m, rgb=rgb.astype(np.uint8), buildings=self.buildings[at],
+            labelled=self.labelled[at],
+        )  # fmt: skip
 
 
 def _read(path: Path, flags: int) -> ByteArray:
@@ -103,7 +108,8 @@ def read_pairs(images: Path, masks: Path, gsd_m: float) -> Iterator[Scene]:
         rgb, buildings = _read_rgb(image), components(_read(mask, cv2.IMREAD_GRAYSCALE))
         if rgb.shape[:2] != buildings.shape:
             raise PlaceError(f"{mask}: its size is not that of {image.name}; make it again")
-        yield Scene(image.stem, gsd_m, rgb, buildings, np.ones(buildings.shape, dtype=np.bool_))
+        everywhere = np.ones(buildings.shape, dtype=np.bool_)
+        yield Scene(image.stem, gsd_m, rgb, buildings, everywhere, told_apart=False)
 
 
 def read_inria(folder: Path) -> Iterator[tuple[str, Scene]]:
@@ -134,9 +140,8 @@ def read_web_tiles(images: Path, masks: Path, only_zoom: int | None = None) -> I
             window = np.s_[(y - top) * side : (y - top + 1) * side, (x - left) * side : (x - left + 1) * side]
             rgb[window], mask_all[window] = _read_rgb(image), _read(mask, cv2.IMREAD_GRAYSCALE)
             labelled[window] = True
-        yield Scene(
-            f"z{zoom}", web_tile_gsd_m(top + rows / 2.0, zoom, side), rgb, components(mask_all), labelled
-        )
+        gsd = web_tile_gsd_m(top + rows / 2.0, zoom, side)
+        yield Scene(f"z{zoom}", gsd, rgb, components(mask_all), labelled, told_apart=False)
 
 
 def web_tile_gsd_m(y: float, zoom: int, side_px: int) -> float:
@@ -207,7 +212,8 @@ def read_web_ortho(images: Path, masks: Path, outlines: Path) -> Scene:
             ]
         ),
     )
-    return replace(scene, buildings=drawn(_polygons(pixels), scene.buildings.shape))
+    outlined = drawn(_polygons(pixels), scene.buildings.shape)
+    return replace(scene, buildings=outlined, told_apart=True)
 
 
 def _web_origin(masks: Path) -> tuple[int, int, int, int]:
@@ -277,9 +283,9 @@ def patches(scene: Scene) -> list[Scene]:
         window = np.s_[top : top + height, left : left + width]
         labelled = part[window] == number
         found.append(
-            Scene(
-                f"{scene.name}#{number}" if count > 2 else scene.name, scene.gsd_m, scene.rgb[window],
-                np.where(labelled, scene.buildings[window], 0).astype(np.int32), labelled,
+            replace(
+                scene, name=f"{scene.name}#{number}" if count > 2 else scene.name, rgb=scene.rgb[window],
+                buildings=np.where(labelled, scene.buildings[window], 0).astype(np.int32), labelled=labelled,
             )
         )  # fmt: skip
     return found
