@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -10,6 +11,9 @@ import numpy as np
 from buildloc_msgs_py.types import ByteArray, FloatArray
 from numpy.typing import NDArray
 
+CONTRAST = 0.04  # that a SIFT feature must have: of towns, and the noise has none of it
+FAINT = 0.01  # of meadows, where few features have more
+FEW = 500  # features with CONTRAST
 QUARTER_TURNS: tuple[int, ...] = (0, 1, 2, 3)
 
 
@@ -69,13 +73,16 @@ class Sift:
         self._features, self._width_px, self._ratio = features, width_px, ratio
 
     def prepare(self, grey: ByteArray) -> Described:
-        """The strongest features of the image, shrunk to ``width_px`` where it is wider."""
+        """The strongest features of the image, shrunk to ``width_px`` where it is wider; faint ones too where
+        there are few others."""
         zoom = min(1.0, self._width_px / grey.shape[1])
         if zoom < 1.0:
             grey = np.asarray(
                 cv2.resize(grey, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA), dtype=np.uint8
             )
-        keypoints, descriptors = cv2.SIFT.create(nfeatures=self._features).detectAndCompute(grey, None)
+        keypoints, descriptors = self._detect(grey, CONTRAST)
+        if len(keypoints) < min(FEW, self._features):
+            keypoints, descriptors = self._detect(grey, FAINT)
         if descriptors is None:
             return Described(np.empty((0, 2)), np.empty((0, 128), dtype=np.uint8))
         strongest = np.argsort([-k.response for k in keypoints], kind="stable")
@@ -83,6 +90,11 @@ class Sift:
         return Described(
             uv, descriptors[strongest].astype(np.uint8)
         )  # whole numbers, a quarter of the memory
+
+    def _detect(self, grey: ByteArray, contrast: float) -> tuple[Sequence[Any], NDArray[Any] | None]:
+        sift = cv2.SIFT.create(nfeatures=self._features, contrastThreshold=contrast)
+        keypoints, descriptors = sift.detectAndCompute(grey, None)
+        return keypoints, descriptors
 
     def match(self, earlier: Described, later: Described) -> Matches:
         """Nearest neighbours that pass the ratio test, one to one."""

@@ -116,6 +116,16 @@ def test_a_repeated_frame_has_not_moved(method: str) -> None:
     assert np.allclose(link.transform, (0.0, 0.0, 0.0, 1.0), atol=1e-3)
 
 
+def test_faint_ground_is_registered_by_faint_features() -> None:
+    faint = [
+        replace(frame, image_bgr=cv2.convertScaleAbs(frame.image_bgr, alpha=0.3, beta=60))
+        for frame in (FIRST, SECOND)
+    ]
+    plain, link = registered(FIRST, SECOND, MapperConfig()), registered(*faint, MapperConfig())
+    assert isinstance(plain, Link) and isinstance(link, Link)
+    assert np.allclose(link.transform, plain.transform, atol=0.05)
+
+
 def test_exposure_changes_do_not_move_the_camera() -> None:
     darker = replace(SECOND, image_bgr=cv2.convertScaleAbs(SECOND.image_bgr, alpha=0.6, beta=5))
     there, same = (registered(FIRST, frame, MapperConfig()) for frame in (darker, SECOND))
