@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -76,6 +77,17 @@ def test_maps_are_those_of_the_mapper_to_the_last_bit(track: Track, maps: Maps) 
         assert snapshot.local_map.stamp_ns == update.local_map.stamp_ns
         np.testing.assert_array_equal(snapshot.local_map.centroids_m, update.local_map.centroids_m)
         np.testing.assert_array_equal(snapshot.local_map.ids, update.local_map.ids)
+
+
+def test_a_keyframe_that_links_to_nothing_leaves_the_map_before_it(track: Track, maps: Maps) -> None:
+    lost = replace(track, poses=(*track.poses[:4], None, *({k: p for k, p in poses.items() if k != 4}
+                                                         for poses in track.poses[5:] if poses)))  # fmt: skip
+    found = map_flight(lost, masks(track, town(), FAULTLESS, 1), MAPPER)
+    assert found.snapshots[4] is found.snapshots[3]
+    last = found.snapshots[-1]
+    assert last is not None and last.numbers == (0, 1, 2, 3, 5, 6, 7)
+    none = map_flight(replace(track, poses=(None,) * 8), masks(track, town(), FAULTLESS, 1), MAPPER)
+    assert none.snapshots == (None,) * 8
 
 
 def test_faultless_masks_give_the_true_buildings_where_they_truly_are(maps: Maps) -> None:

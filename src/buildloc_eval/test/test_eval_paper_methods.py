@@ -20,11 +20,13 @@ from buildloc_eval.paper.published import FLIGHTS
 from buildloc_eval.paper.report import (
     Converged,
     Trial,
+    acceptance_table,
     boston,
     convergence_table,
     failure_table,
     failures_one_by_one,
     held,
+    recall_table,
     write,
 )
 from buildloc_eval.paper.scoring import (
@@ -179,7 +181,7 @@ def test_every_star_method_finds_a_faultless_map(name: str, outlines: np.ndarray
     assert set(found.seconds) >= {"match", "vote", "select", "refine"}
 
 
-def test_a_keyframe_that_links_to_nothing_is_a_failure_with_its_reason(maps: Maps) -> None:
+def test_a_flight_without_a_map_is_a_failure_with_its_reason(maps: Maps) -> None:
     @dataclass(frozen=True)
     class Never:
         """A matcher that is not asked."""
@@ -188,7 +190,7 @@ def test_a_keyframe_that_links_to_nothing_is_a_failure_with_its_reason(maps: Map
     found = methods.locate(Never(), alone, 1, final=True)  # type: ignore[arg-type]
     result = score(found, alone, 1, 1.0)
     assert result == Score(0, math.inf, math.inf, bins_within(1.0), False, str(found.refused))
-    assert "links to none" in result.lost_by
+    assert "no keyframe is mapped" in result.lost_by
 
 
 def prediction(places: list[list[float]], bins: list[list[int]]) -> Prediction:
@@ -264,6 +266,31 @@ def test_convergence_is_over_flights_and_seeds_that_reach_it() -> None:
     assert row["first success_95%"] == mean_interval([2.5, 4.0])
     assert row["by flight, first"] == "flight1: 3.0 (2 to 4), flight2: 3.0 (3 to 3)"
     assert row["by flight, stable"] == "flight1: 4.0 (2 to 6), flight2: never"
+
+
+def test_a_method_that_was_not_run_at_a_radius_is_told_as_such() -> None:
+    right = Score(1, 3.0, 2.0, 1, True, "")
+    place = prediction([[0.0, 0.0]], [[0, 0]])
+    trials = [Trial("default preset", 6, "flight1", 1, right, place),
+              Trial("default preset", 9, "flight1", 1, right, place),
+              Trial("paper preset", 6, "flight1", 1, right, place)]  # fmt: skip
+    cells = {(row["method"], row["metric"]): row.get("9 km") for row in recall_table(trials, (6, 9))}
+    assert cells["paper preset", "R@1"] == "not run"
+    assert cells["default preset", "R@1"] == "1.000 [0.21, 1.00] of 1"
+    assert [(row["method"], row["radius_km"]) for row in acceptance_table(trials, (6, 9))] == [
+        ("paper preset", 6), ("default preset", 6), ("default preset", 9),
+    ]  # fmt: skip
+
+
+def test_after_a_keyframe_that_links_to_nothing_the_last_place_of_the_map_counts(
+    outlines: np.ndarray, maps: Maps
+) -> None:
+    lost = replace(maps, snapshots=(*maps.snapshots[:-1], maps.snapshots[-2]))
+    database = methods.reference_within(measured(outlines), CENTRE, 0.8)
+    matcher = methods.make_matcher("default preset", database)
+    found = methods.locate(matcher, lost, len(maps.true_m), final=True)
+    result = score(found, lost, len(maps.true_m), 0.8)
+    assert result.rank == 1 and result.final_m < 2.0  # of the last but one, 33 m behind
 
 
 def test_a_failure_is_told_with_its_funnel() -> None:

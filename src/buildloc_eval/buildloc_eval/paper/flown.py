@@ -88,9 +88,9 @@ class Snapshot:
 
 @dataclass(frozen=True)
 class Maps:
-    """One flight of one seed: a map after every keyframe (none where it links to nothing), what each keyframe
-    observed, its ratios (N, 3) of built ground in regions of ``radii_m``, and the true positions (N, 2) and
-    yaws (N,) of all."""
+    """One flight of one seed: the map that the mapper has published after every keyframe (where one links to
+    nothing, the one before it; none before the first), what each keyframe observed, its ratios (N, 3) of built
+    ground in regions of ``radii_m``, and the true positions (N, 2) and yaws (N,) of all."""
 
     snapshots: tuple[Snapshot | None, ...]
     observations: tuple[FrameObservation, ...]
@@ -169,7 +169,7 @@ def masks(track: Track, outlines: Outlines, errors: SegmentationErrors, seed: in
 
 def map_flight(track: Track, seen: Iterator[Mask], config: MapperConfig) -> Maps:
     """What the mapper makes of the masks of a registered flight, as :class:`Mapper` does keyframe by
-    keyframe."""
+    keyframe. One that links to nothing publishes nothing: whoever has the map before goes on with it."""
     fusion, extractor = Fusion(config), Extractor(config)
     views: dict[int, View] = {}
     snapshots: list[Snapshot | None] = []
@@ -183,7 +183,7 @@ def map_flight(track: Track, seen: Iterator[Mask], config: MapperConfig) -> Maps
         observations.append(observe(mask.pixels, shot.stamp_ns, *telemetry, config.min_area_m2))
         ratios.append(coverage(mask.pixels, *telemetry, radii_m))
         if poses is None:
-            snapshots.append(None)
+            snapshots.append(snapshots[-1] if snapshots else None)
             continue
         dirty = fusion.update(views, poses)
         found = extractor.update(fusion, dirty, shot.stamp_ns)

@@ -93,7 +93,7 @@ def locate(matcher: Matcher, maps: Maps, keyframes: int, final: bool) -> Predict
     """The ranking after so many keyframes, with the refined place of the last one if ``final``."""
     snapshot = maps.snapshots[keyframes - 1]
     if snapshot is None:
-        return nothing("keyframe links to none of the latest keyframes")
+        return nothing("no keyframe is mapped yet")
     try:
         found = matcher.locate(snapshot.local_map)
     except BuildlocError as error:

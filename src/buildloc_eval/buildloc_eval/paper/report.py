@@ -117,9 +117,7 @@ def recall_table(scored: Sequence[Trial], radii_km: Sequence[int]) -> list[dict[
             row: dict[str, Any] = {"method": name, "metric": f"R@{k}"}
             for radius in radii_km:
                 mine = [t.score for t in scored if (t.method, t.radius_km) == (name, radius)]
-                found = recall_row(mine)
-                low, high = found[f"recall@{k}_95%"]
-                row[f"{radius} km"] = f"{found[f'recall@{k}']:.3f} [{low:.2f}, {high:.2f}] of {len(mine)}"
+                row[f"{radius} km"] = _recall_cell(mine, k)
                 row[f"paper, {radius} km"] = (
                     f"{RECALL[PUBLISHED.get(name, name)][k][RADII_KM.index(radius)]}/7"
                 )
@@ -128,6 +126,14 @@ def recall_table(scored: Sequence[Trial], radii_km: Sequence[int]) -> list[dict[
         cells = {f"paper, {r} km": f"{RECALL[NETVLAD][k][RADII_KM.index(r)]}/7" for r in radii_km}
         rows.append({"method": f"{NETVLAD} (not run)", "metric": f"R@{k}", **cells})
     return rows
+
+
+def _recall_cell(scores: Sequence[Score], k: int) -> str:
+    if not scores:
+        return "not run"
+    found = recall_row(scores)
+    low, high = found[f"recall@{k}_95%"]
+    return f"{found[f'recall@{k}']:.3f} [{low:.2f}, {high:.2f}] of {len(scores)}"
 
 
 def flight_table(
@@ -239,7 +245,10 @@ def acceptance_table(scored: Sequence[Trial], radii_km: Sequence[int]) -> list[d
     rows = []
     for name in (n for n in methods_of(scored) if n not in (BRM, NETVLAD)):
         for radius in radii_km:
-            found = recall_row([t.score for t in scored if (t.method, t.radius_km) == (name, radius)])
+            mine = [t.score for t in scored if (t.method, t.radius_km) == (name, radius)]
+            if not mine:
+                continue
+            found = recall_row(mine)
             kept = {key: found[key] for key in ("trials", "final within 100 m", "fixes", "false fixes")}
             rows.append({"method": name, "radius_km": radius, **kept})
     return rows

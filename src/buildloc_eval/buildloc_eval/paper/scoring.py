@@ -36,9 +36,11 @@ class Score:
 
 
 def score(found: Prediction, maps: Maps, keyframes: int, radius_km: float) -> Score:
-    """Compare a prediction after so many keyframes with the truth."""
-    last = maps.true_m[keyframes - 1]
-    snapshot, truth = maps.snapshots[keyframes - 1], last
+    """Compare a prediction after so many keyframes with the truth: places of a camera with that of the last
+    keyframe of the map."""
+    snapshot = maps.snapshots[keyframes - 1]
+    last = maps.true_m[keyframes - 1 if snapshot is None else max(snapshot.numbers)]
+    truth = last
     if found.centre_m is not None and snapshot is not None:
         truth = true_place(maps, snapshot, found.centre_m)
     final = math.inf if found.final_m is None else float(np.hypot(*(found.final_m - last)))
