@@ -89,8 +89,8 @@ class Snapshot:
 @dataclass(frozen=True)
 class Maps:
     """One flight of one seed: the map that the mapper has published after every keyframe (where one links to
-    nothing, the one before it; none before the first), what each keyframe observed, its ratios (N, 3) of built
-    ground in regions of ``radii_m``, and the true positions (N, 2) and yaws (N,) of all."""
+    nothing, the one before it; none before the first), what each keyframe observed, its ratios (N, 3) of
+    built ground in regions of ``radii_m``, and the true positions (N, 2) and yaws (N,) of all."""
 
     snapshots: tuple[Snapshot | None, ...]
     observations: tuple[FrameObservation, ...]
