@@ -118,6 +118,54 @@ def test_an_image_of_ground_and_one_of_roof() -> None:
     assert len(roof) == 1 and draw_mask(roof, (60, 40)).min() == 255
 
 
+def plain_holes(mask: np.ndarray, max_px: float) -> np.ndarray:
+    """Filled holes by the definition: each component of the background on its own."""
+    filled = mask.copy()
+    parts, part = cv2.connectedComponents(1 - mask, connectivity=4)
+    border = np.unique(np.concatenate([part[0], part[-1], part[:, 0], part[:, -1]]))
+    for number in set(range(1, parts)) - set(border.tolist()):
+        if (part == number).sum() < max_px:
+            filled[part == number] = 1
+    return filled
+
+
+def plain_instances(mask: np.ndarray, cores: np.ndarray, min_core_px: float, min_px: float) -> np.ndarray:
+    """Instances by the definition: every pixel of a part belongs to the core closest to it within the mask."""
+    labels = np.zeros(mask.shape, dtype=np.int32)
+    parts, part = cv2.connectedComponents(mask, connectivity=8)
+    for number in range(1, parts):
+        inside = (part == number).astype(np.uint8)
+        count, core = cv2.connectedComponents(cores & inside, connectivity=4)
+        large = [k for k in range(1, count) if (core == k).sum() >= min_core_px]
+        grown = np.where(np.isin(core, large), core, 0) if large else inside.astype(np.int32)
+        while (inside.astype(bool) & (grown == 0)).any():
+            wider = cv2.dilate(grown.astype(np.float32), np.ones((3, 3), np.uint8)).astype(np.int32)
+            grown = np.where((grown == 0) & (inside > 0), wider, grown)
+        for k in set(np.unique(grown).tolist()) - {0}:
+            if (grown == k).sum() >= max(min_px, 1.0):
+                labels[grown == k] = labels.max() + 1
+    return labels
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_fast_way_finds_what_the_definition_says(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    noise = cv2.GaussianBlur(rng.normal(0.0, 40.0, (120, 160)).astype(np.float32), (0, 0), 3.0)
+    mask = (noise > 0.0).astype(np.uint8)
+    filled = fill_holes(mask, 60.0)
+    # An island in a hole counts for the hole, in the definition it does not: a few pixels.
+    assert (filled != plain_holes(mask, 60.0)).mean() < 2e-3
+    core = np.where(noise > 1.5, 5.0, -5.0).astype(np.float32)
+    instances = find_instances(np.where(filled > 0, 5.0, -5.0).astype(np.float32), core, GSD_M, 2.4, 0.1)
+    smooth = cv2.GaussianBlur(core, (0, 0), 0.6 / GSD_M) > 0.0
+    plain = plain_instances(filled, filled & smooth.astype(np.uint8), 25.0, 60.0)
+    assert len(instances) == plain.max() > 5
+    # Which of two cores is closer is a tie along the line between them, and the flood goes along the axes.
+    _, pixels = np.unique(np.stack([instances.labels, plain])[:, plain > 0], axis=1, return_counts=True)
+    assert np.sort(pixels)[-plain.max() :].sum() > 0.97 * pixels.sum()
+    assert ((instances.labels > 0) == (plain > 0)).mean() > 0.995
+
+
 @pytest.mark.parametrize("turns", [1, 2, 3])
 def test_quarter_turns_turn_the_buildings(turns: int) -> None:
     rng = np.random.default_rng(turns)
