@@ -50,22 +50,36 @@ class Instances:
         return np.clip(np.abs(self.building), 0.5, MAX_LOGIT)
 
 
+def probability(logits: FloatImage) -> FloatImage:
+    """Of logits, of any shape."""
+    return np.asarray(1.0 / (1.0 + np.exp(-np.clip(logits, -60.0, 60.0))), dtype=np.float32)
+
+
 def find_instances(
-    building: FloatImage, core: FloatImage | None, gsd_m: float, min_area_m2: float, image_gsd_m: float
+    building: FloatImage,
+    core: FloatImage | None,
+    gsd_m: float,
+    min_area_m2: float,
+    min_score: float,
+    image_gsd_m: float,
 ) -> Instances:
     """Split a building score (h, w) into buildings, by the score of their cores where there is one.
 
     A core is what lies well inside one building; touching roofs have separate ones. Each grows in its
     connected part of the mask until it meets the next. A part without a core is one building. Holes and
-    buildings below ``min_area_m2`` are removed. ``image_gsd_m`` is that of the image the mask is for.
+    buildings below ``min_area_m2`` are removed, and buildings whose pixels have a mean probability below
+    ``min_score``. ``image_gsd_m`` is that of the image the mask is for.
     """
     min_px = min_area_m2 / gsd_m**2
     mask = fill_holes((building > 0.0).view(np.uint8), min_px)
     labels = _separated(mask, _cores(mask, core, gsd_m), MIN_CORE_M2 / gsd_m**2)
-    at = np.flatnonzero(mask.view(np.bool_))
-    numbers = labels.ravel()[at]
-    kept = np.bincount(numbers, minlength=1) >= max(min_px, 1.0)
-    labels.ravel()[at] = np.where(kept, np.cumsum(kept), 0).astype(np.int32)[numbers]
+    inside = mask.view(np.bool_)
+    numbers = labels[inside]
+    pixels = np.bincount(numbers, minlength=1)
+    score = np.bincount(numbers, probability(building[inside]), len(pixels)) / np.maximum(pixels, 1)
+    kept = (pixels >= max(min_px, 1.0)) & (score >= min_score)
+    kept[0] = False
+    labels[inside] = np.where(kept, np.cumsum(kept), 0).astype(np.int32)[numbers]
     gap_m = max(GAP_M, GAP_PX * image_gsd_m)
     return Instances(labels, building, _between(labels, max(1, round(0.5 * gap_m / gsd_m))), gsd_m)
 
@@ -147,7 +161,7 @@ def draw_mask(instances: Instances, size: tuple[int, int]) -> ByteArray:
     inside = (instances.labels > 0) & ~instances.between
     margin = instances.margin()
     field = cv2.resize(np.where(inside, margin, -margin), size, interpolation=cv2.INTER_LINEAR)
-    return np.asarray(cv2.compare(field, 0.0, cv2.CMP_GT), dtype=np.uint8)
+    return (field > 0.0).view(np.uint8) * np.uint8(255)
 
 
 def owned(instances: Instances, window: tuple[float, float, float, float]) -> Instances:
