@@ -13,6 +13,7 @@ from buildloc_msgs_py.errors import BuildlocError
 from buildloc_segmenter.config import SegmenterConfig
 from buildloc_segmenter.network import Network
 
+from buildloc_eval.bars import bar_table
 from buildloc_eval.html import write_report
 from buildloc_eval.instance_metrics import (
     HALF,
@@ -28,7 +29,7 @@ from buildloc_eval.overlapping import Overlap, flicker, overlaps
 from buildloc_eval.overlays import draw_windows, largest
 from buildloc_eval.places import Scene, overlap, patches, place
 from buildloc_eval.realworld import data_folder
-from buildloc_eval.segmentation_bars import bars_table, case_bars, speed_bars
+from buildloc_eval.segmentation_bars import case_bars, speed_bars
 from buildloc_eval.segmentation_errors import POOLED, SegmentationErrors, measured, summary, write_errors
 from buildloc_eval.segmented import MAPPED_AREA_M2, SCORED_GSD_M, Scored, busiest, disturbed, score
 from buildloc_eval.speed import TRAINING_KEY, frame_jpeg, speed, speed_table
@@ -250,7 +251,9 @@ def evaluate(out: Path, plan: Plan, progress: Progress) -> str:
     if plan.speed:
         progress("speed")
         speeds = speed(frame_jpeg(imagery), plan.speed, plan.config)
-    bars = [*(bar for result in results for bar in case_bars(result.report)), *speed_bars(speeds)]
+    bars = speed_bars(speeds)
+    for result in results:
+        bars |= case_bars(result.report)
     report = {
         "evaluation": "segmentation",
         "what is real": REAL,
@@ -260,7 +263,7 @@ def evaluate(out: Path, plan: Plan, progress: Progress) -> str:
         "quick": plan.quick,
         "how it is counted": RULES,
         **machine(),
-        "bars": {bar.what: asdict(bar) | {"met": bar.met} for bar in bars},
+        "bars": bars,
         "speed": speeds,
         "error model": {name: asdict(values) for name, values in errors.items()},
         "cases": {f"{r.report['place']}, {r.report['model']}": r.report for r in results},
@@ -275,7 +278,7 @@ def evaluate(out: Path, plan: Plan, progress: Progress) -> str:
         }
         about = {key: report[key] for key in ("what is real", "seed", "quick", "date")}
         write_errors(plan.errors, about | {"network, place: what trained it": names}, errors)
-    lines = [table([r.report for r in results]), *speed_table(speeds), *summary(errors), *bars_table(bars)]
+    lines = [table([r.report for r in results]), *speed_table(speeds), *summary(errors), bar_table(bars)]
     return "\n".join(lines)
 
 
