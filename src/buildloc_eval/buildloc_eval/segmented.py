@@ -98,9 +98,8 @@ def score(network: Network, scene: Scene) -> Scored:
     """A connected piece of ground, its picture as it comes."""
     truth = scene.resampled(SCORED_GSD_M)
     finds = find(network, bgr(scene), scene.gsd_m, truth.labelled.shape)
-    sides = (finds.instances, finds.plain, finds.wire)
-    compared = [against(truth, side) for side in sides]
-    return Scored(truth, finds, *compared, against(truth, finds.wire, MAPPED_AREA_M2))
+    instances, plain, wire = (against(truth, side) for side in (finds.instances, finds.plain, finds.wire))
+    return Scored(truth, finds, instances, plain, wire, against(truth, finds.wire, MAPPED_AREA_M2))
 
 
 def against(truth: Scene, found: Labels, min_area_m2: float = MIN_AREA_M2) -> Comparison:
