@@ -31,7 +31,7 @@ from buildloc_matcher.mesh import Mesh, mesh
 from buildloc_matcher.pursuit import Agreement, Place, Pose, sigmas_apart
 from buildloc_matcher.reference.buildings import OUTLINE_UNIT_M
 from buildloc_matcher.reference.database import DatabaseError, ReferenceDatabase, descriptor_hash
-from buildloc_matcher.refinement import Refined, Unrefined, covariance_enu, refine
+from buildloc_matcher.refinement import Refined, Unrefined, covariance_enu, refine, registration_covariance
 from buildloc_matcher.selection import Score, local_transform, select
 from buildloc_matcher.voting import Cluster, vote
 from buildloc_matcher.window import start_covariance
@@ -277,7 +277,7 @@ class Matcher:
         observations: Sequence[FrameObservation],
     ) -> Followed:
         """Whether the reference agrees that the last keyframe lies where ``predicted`` (map -> world) puts
-        it, up to a covariance (3, 3) over east, north and yaw."""
+        it, up to a covariance (3, 3) over east, north and yaw, the reference's registration included."""
         config, reference = self.config, self.database.ground
         last = max(keyframes, key=lambda k: k.stamp_ns)
         refined = refine(predicted, keyframes, observations, reference, config)
@@ -291,7 +291,7 @@ class Matcher:
         refused = refined.reason if isinstance(refined, Unrefined) else refuse_refined(refined, config)
         if isinstance(refined, Unrefined) or refused is not None:
             return Followed(replace(opinion, outcome=Outcome.UNDECIDED, reason=refused or ""), None)
-        apart = sigmas_apart(offset, covariance + refined.covariance)
+        apart = sigmas_apart(offset, covariance, refined.covariance, registration_covariance(config))
         if apart > config.max_jump_sigmas:
             jump = f"the place jumped by {math.hypot(*offset[:2]):.1f} m, {apart:.1f} standard deviations"
             return Followed(replace(opinion, outcome=Outcome.REJECTED, reason=jump), None)

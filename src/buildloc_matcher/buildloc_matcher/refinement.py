@@ -113,8 +113,7 @@ def refine(
     rival_m = optima.rival_m(solution)
     if rival_m is not None:
         return Unrefined(f"refinement found two optima {rival_m:.1f} m apart that fit alike")
-    registration = np.diag([*2 * [config.sigma_registration_m**2], 0.0])
-    covariance = config.sigma_inflation**2 * solution.covariance + registration
+    covariance = config.sigma_inflation**2 * solution.covariance + registration_covariance(config)
     position, yaw = solution.state.poses[-1, :2], float(wrap(solution.state.poses[-1, 2]))
     return Refined(
         position, yaw, covariance, dict(zip(window.stamps_ns, solution.state.poses, strict=True)),
@@ -212,6 +211,11 @@ def horizontal_variance(
     residual = max(rms_m**2, 2.0 * config.sigma_building_m**2)
     variance = residual / math.sqrt(len(matched_m)) * (1.0 + lever / max(spread, 1.0))
     return variance + config.sigma_registration_m**2
+
+
+def registration_covariance(config: MatcherConfig) -> FloatArray:
+    """(3, 3) over east, north and yaw of what all places found in the reference share."""
+    return np.diag([*2 * [config.sigma_registration_m**2], 0.0])
 
 
 def covariance_enu(pose_covariance: FloatArray, config: MatcherConfig) -> FloatArray:
