@@ -69,14 +69,26 @@ def noise(rng: np.random.Generator, side: int, coarsest_px: int) -> Image:
     return total / total.std()
 
 
-def _draw(plane: NDArray[np.uint8], outline: Points) -> None:
-    cv2.fillPoly(plane, [np.round(outline * 2**SUBPIXEL).astype(np.int32)], 1, cv2.LINE_8, SUBPIXEL)
+Pixels = tuple[NDArray[np.intp], NDArray[np.intp]]  # rows and columns
 
 
-def _inside(shape: tuple[int, ...], outline: Points) -> NDArray[np.bool_]:
-    plane = np.zeros(shape[:2], dtype=np.uint8)
-    _draw(plane, outline)
-    return plane > 0
+def _inside(shape: tuple[int, ...], outline: Points) -> Pixels:
+    """The pixels of a picture that an outline covers."""
+    corners = np.round(outline * 2**SUBPIXEL).astype(np.int32)
+    low, high = corners.min(axis=0) >> SUBPIXEL, (corners.max(axis=0) >> SUBPIXEL) + 2
+    left, top = np.clip(low - 1, 0, (shape[1], shape[0]))
+    right, bottom = np.clip(high, 0, (shape[1], shape[0]))
+    plane = np.zeros((max(0, bottom - top), max(0, right - left)), dtype=np.uint8)
+    if plane.size:
+        cv2.fillPoly(plane, [corners - (np.array([left, top]) << SUBPIXEL)], 1, cv2.LINE_8, SUBPIXEL)
+    rows, columns = np.nonzero(plane)
+    return rows + top, columns + left
+
+
+def _where(pixels: Pixels, plane: NDArray[np.bool_]) -> Pixels:
+    """Those at which the plane is true."""
+    kept = plane[pixels]
+    return pixels[0][kept], pixels[1][kept]
 
 
 def rectangle(centre: Points, length: float, width: float, angle: float) -> Points:
@@ -130,14 +142,14 @@ class Canvas:
         """Fill an outline with a rough colour, not over roofs when ``ground_only``."""
         where = _inside(self.labels.shape, outline)
         if ground_only:
-            where &= self.labels == 0
+            where = _where(where, self.labels == 0)
         self.rgb[where] = colour + self.fine[where] * roughness
 
     def shade(self, outline: Points, height_px: float) -> None:
         """Darken the ground that a body of this outline and height casts its shadow on."""
         tip = outline + self.light.away * height_px * self.light.stretch
         hull = cv2.convexHull(np.vstack([outline, tip]).astype(np.float32))[:, 0].astype(np.float64)
-        where = _inside(self.labels.shape, hull) & (self.labels == 0)
+        where = _where(_inside(self.labels.shape, hull), self.labels == 0)
         self.rgb[where] *= self.light.shade
 
     def car(self, centre: Points, angle: float) -> None:
@@ -287,8 +299,9 @@ def building(canvas: Canvas, number: int, centre: Points, length: float, width: 
                 angle + math.pi / 2,
             )
         )
-    masks = [_inside(canvas.labels.shape, rectangle(*wing)) for wing in wings]
-    footprint = np.logical_or.reduce(masks)
+    footprint = np.zeros(canvas.labels.shape, dtype=np.bool_)
+    for wing in wings:
+        footprint[_inside(footprint.shape, rectangle(*wing))] = True
     taken = canvas.labels > 0
     if not footprint.any() or taken[footprint].mean() > 0.1:  # pixels that touching houses share
         return False
@@ -305,15 +318,14 @@ def building(canvas: Canvas, number: int, centre: Points, length: float, width: 
     stripes, amplitude = rng.uniform(0.25, 1.2) / canvas.gsd, rng.uniform(0.0, 0.12)
     contrast = rng.uniform(0.2, 1.2) * (1.0 - canvas.light.shade)
     colour = _roof_colour(rng)
-    rows, columns = np.mgrid[: canvas.side, : canvas.side].astype(np.float32)
-    for (at, long, wide, a), mask in zip(wings, masks, strict=True):
+    for at, long, wide, a in wings:
         if rng.random() < 0.25:
             colour = _roof_colour(rng)
         t = np.array([[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]])
         for face, downhill in _roof_faces(long, wide, kind):
-            where = _inside(canvas.labels.shape, at + face @ t.T) & mask & ~taken
+            rows, columns = where = _where(_inside(footprint.shape, at + face @ t.T), footprint)
             lit = max(0.3, 1.0 - contrast * float((t @ downhill) @ canvas.light.away))
-            along = columns[where] * math.cos(a) + rows[where] * math.sin(a)
+            along = columns * math.cos(a) + rows * math.sin(a)
             ribs = 1.0 + amplitude * np.sin(along * (math.tau / max(stripes, 2.2)))
             canvas.rgb[where] = colour * lit * ribs[:, None] + canvas.fine[where] * rng.uniform(1.0, 8.0)
     canvas.labels[footprint] = number
@@ -325,7 +337,7 @@ def building(canvas: Canvas, number: int, centre: Points, length: float, width: 
             else (canvas.px(2, 6), canvas.px(1.5, 3))
         )
         shine = rng.choice((0.4, 0.6, 1.5)) * colour if rng.random() < 0.6 else np.float32([44, 56, 84])
-        where = _inside(canvas.labels.shape, rectangle(spot, *size, angle)) & footprint
+        where = _where(_inside(footprint.shape, rectangle(spot, *size, angle)), footprint)
         canvas.rgb[where] = shine
     return True
 

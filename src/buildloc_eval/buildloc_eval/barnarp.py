@@ -29,6 +29,7 @@ from buildloc_msgs_py.types import ByteArray, Fix, FloatArray, Frame
 from buildloc_segmenter.config import SegmenterConfig
 from buildloc_segmenter.segmenter import Segmenter
 
+from buildloc_eval.bars import Bar, bar_table, judge
 from buildloc_eval.camera import look
 from buildloc_eval.flight import FlightConfig, fly
 from buildloc_eval.flights import LiveFlight, evaluate_live
@@ -50,6 +51,16 @@ BASELINE = "models/baseline_west.onnx"
 NEAR_BIN_M = 150.0  # the true 100 m bin and its eight neighbours
 FOUND_M = 5.0
 WRONG_M = 100.0
+BARS = [
+    bar
+    for flight in ("east_baseline", "all_shipped")
+    for bar in (
+        Bar(flight, "timing.fixes_per_second", 5.0, at_least=True),
+        Bar(flight, "timing.latency_p95_s", 0.3),
+        Bar(flight, "wrong_fixes", 0),
+        Bar(flight, "median_error_m", 3.0),
+    )
+]
 
 
 @dataclass(frozen=True)
@@ -235,9 +246,11 @@ def evaluate(out: Path, seed: int, quick: bool) -> str:
     for case in flown:
         results[case.name], live = run_case(case, ground, data, database, database_path, out, seed)
         pictures.append((case.title, live.picture))
+    judged = judge(BARS, results)
     report = {
         "evaluation": "barnarp",
         "imagery": "real (orthophoto), flights simulated over it",
+        "bars": judged,
         "reference_buildings": len(database),
         "seed": seed,
         **machine(),
@@ -245,4 +258,4 @@ def evaluate(out: Path, seed: int, quick: bool) -> str:
     }
     (out / "report.json").write_text(json.dumps(report, indent=2) + "\n")
     write_report(out / "report.html", "Barnarp: real imagery through the whole method", report, pictures)
-    return json.dumps(report["flights"], indent=2)
+    return f"{json.dumps(results, indent=2)}\n\n{bar_table(judged)}\n{out / 'report.html'}"

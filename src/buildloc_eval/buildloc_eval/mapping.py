@@ -14,7 +14,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import shapely
@@ -28,6 +27,7 @@ from buildloc_msgs_py.types import FloatArray, LocalMap
 from numpy.typing import NDArray
 
 from buildloc_eval import endurance
+from buildloc_eval.bars import Bar, bar_table, judge, table
 from buildloc_eval.cut import CutFlight, cut
 from buildloc_eval.flight import FlightConfig, follow, tour
 from buildloc_eval.flown import Aligned, Flight, Path2d, align, draw, mapped, path_of, unrectified
@@ -58,26 +58,6 @@ IMAGERY = {
         "middle only; endurance flies over barnarp and its mirror image"
     ),
 }
-
-
-@dataclass(frozen=True)
-class Bar:
-    """What must be reached: a figure of a section by its path, at least or at most."""
-
-    section: str
-    figure: str
-    limit: float
-    at_least: bool = False
-
-    def judge(self, sections: dict[str, Scores]) -> dict[str, Any] | None:
-        """Limit, measured, held; None when the section was not run."""
-        if self.section not in sections:
-            return None
-        value: Any = sections[self.section]
-        for part in self.figure.split("."):
-            value = value.get(part) if isinstance(value, dict) else None
-        held = value is not None and (value >= self.limit if self.at_least else value <= self.limit)
-        return {"at least" if self.at_least else "at most": self.limit, "measured": value, "held": held}
 
 
 BARS = (
@@ -293,7 +273,7 @@ def evaluate(out: Path, seed: int, quick: bool, progress: Progress) -> str:
     pictures = [
         (caption, folder / file) for part in scores.values() for caption, file in part.pop(PICTURES, ())
     ]
-    judged = {f"{bar.section}: {bar.figure}": answer for bar in BARS if (answer := bar.judge(scores))}
+    judged = judge(BARS, scores)
     report = {
         "evaluation": "mapping",
         "imagery": IMAGERY,
@@ -319,7 +299,7 @@ def pair_table(sections: dict[str, Scores]) -> str:
         for key, shown in (("pairs", "rectified"), ("plain_pairs", "plain"))
         if key in scores
     ]
-    return _table(("pairs of", "", "registered", "trans med m", "p90 m", "yaw med deg", "p90 deg"), rows)
+    return table(("pairs of", "", "registered", "trans med m", "p90 m", "yaw med deg", "p90 deg"), rows)
 
 
 def path_table(sections: dict[str, Scores]) -> str:
@@ -332,24 +312,4 @@ def path_table(sections: dict[str, Scores]) -> str:
         if (path := scores.get(way))
     ]  # fmt: skip
     head = ("trajectory of", "", "images", "rmse m", "% of length", "loops", "buildings med m")
-    return _table(head, rows)
-
-
-def bar_table(judged: dict[str, dict[str, Any]]) -> str:
-    """One line per bar."""
-    rows = [
-        (name, f"{limit} {answer[limit]:g}", answer["measured"], "held" if answer["held"] else "MISSED")
-        for name, answer in judged.items()
-        for limit in answer.keys() & {"at least", "at most"}
-    ]
-    return _table(("bar", "", "measured", ""), rows)
-
-
-def _table(head: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
-    shown = [head, *(tuple(_cell(value) for value in row) for row in rows)]
-    widths = [max(len(row[i]) for row in shown) for i in range(len(head))]
-    return "\n".join("  ".join(f"{cell:>{w}}" for cell, w in zip(row, widths, strict=True)) for row in shown)
-
-
-def _cell(value: Any) -> str:
-    return "-" if value is None else f"{value:.3f}" if isinstance(value, float) else str(value)
+    return table(head, rows)

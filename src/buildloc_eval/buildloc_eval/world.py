@@ -15,6 +15,7 @@ import geopandas as gpd
 import numpy as np
 import shapely
 from buildloc_msgs_py.errors import BuildlocError
+from buildloc_msgs_py.geodesy import utm_epsg
 from buildloc_msgs_py.types import ByteArray, FloatArray
 from numpy.typing import NDArray
 from pyproj import Transformer
@@ -60,15 +61,9 @@ class World(Surface, Protocol):
         """UTM zone of all coordinates."""
 
 
-def utm_epsg(latitude_deg: float, longitude_deg: float) -> int:
-    """EPSG code of the WGS84 UTM zone of a position."""
-    zone = min(60, int((longitude_deg + 180.0) // 6.0) + 1)
-    return (32600 if latitude_deg >= 0.0 else 32700) + zone
-
-
 def to_utm(latitude_deg: float, longitude_deg: float) -> tuple[int, float, float]:
     """(EPSG, easting, northing)."""
-    epsg = utm_epsg(latitude_deg, longitude_deg)
+    epsg = utm_epsg(longitude_deg, latitude_deg)
     east, north = Transformer.from_crs(4326, epsg, always_xy=True).transform(longitude_deg, latitude_deg)
     return epsg, float(east), float(north)
 
@@ -171,7 +166,7 @@ class TownWorld:
         if len(outlines) == 0 or outlines.crs is None:
             raise WorldError(f"{footprints}: has no georeferenced outlines; give a GeoJSON of polygons")
         west, south, east, north = outlines.to_crs(4326).total_bounds
-        self.epsg = utm_epsg((south + north) / 2.0, (west + east) / 2.0)
+        self.epsg = utm_epsg((west + east) / 2.0, (south + north) / 2.0)
         parts = shapely.get_parts(outlines.to_crs(self.epsg).to_numpy())
         self._polygons = parts[shapely.get_type_id(parts) == shapely.GeometryType.POLYGON]
         if len(self._polygons) == 0:

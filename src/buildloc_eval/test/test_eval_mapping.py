@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
+from buildloc_eval.bars import Bar, bar_table, judge
 from buildloc_eval.cut import cut
 from buildloc_eval.flight import FlightConfig, follow
 from buildloc_eval.flown import Path2d, align
 from buildloc_eval.mapping import (
     BARS,
-    Bar,
-    bar_table,
     bias_scores,
     building_scores,
     configs,
@@ -149,7 +148,9 @@ def test_bars_are_judged_by_what_was_measured() -> None:
     absent = Bar("a", "mapper.yaw.deg", 1.0).judge(sections)
     assert absent == {"at most": 1.0, "measured": None, "held": False}
     assert Bar("b", "mapper.rmse_m", 1.0).judge(sections) is None
-    assert "MISSED" in bar_table({"images": missed.judge(sections)})
+    judged = judge((held, Bar("b", "mapper.rmse_m", 1.0), missed), sections)
+    assert [answer["held"] for answer in judged.values()] == [True, False]
+    assert [line.endswith("MISSED") for line in bar_table(judged).splitlines()[1:]] == [False, True]
 
 
 def test_only_buildings_seen_whole_are_scored() -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import shapely
 from buildloc_msgs_py.footprint import footprints
+from buildloc_msgs_py.geodesy import utm_epsg
 from buildloc_msgs_py.types import FloatArray
 from pyproj import CRS, Transformer
 
@@ -25,7 +26,7 @@ from buildloc_matcher.reference.readers import (
     open_file,
     touching,
 )
-from buildloc_matcher.reference.region import WGS84, Bounds, Region, transformer, utm_epsg
+from buildloc_matcher.reference.region import WGS84, Bounds, Region, transformer
 from buildloc_matcher.reference.spool import CELL_M, ROW, Rows, Spool
 
 # Every geometry read, and every piece gained by splitting one, ends as one of those after "split".

@@ -100,9 +100,3 @@ Region = Circle | Box
 def transformer(source: CRS, target: CRS) -> Transformer:
     """From one reference system to another, x east and y north or longitude and latitude."""
     return Transformer.from_crs(source, target, always_xy=True)
-
-
-def utm_epsg(longitude_deg: float, latitude_deg: float) -> int:
-    """EPSG code of the WGS84 UTM zone of a position."""
-    zone = min(60, int((longitude_deg + 180.0) // 6.0) + 1)
-    return (32600 if latitude_deg >= 0.0 else 32700) + zone
