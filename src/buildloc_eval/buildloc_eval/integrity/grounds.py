@@ -205,7 +205,7 @@ class Grounds:
         column, row = divmod(town % TOWNS, TOWNS_ALIKE)
         first = 1000.0 * place.radii_km[-1] + TOWN_PITCH_M
         east, north = first + column * TOWN_PITCH_M, (row - 0.5 * (TOWNS_ALIKE - 1)) * TOWN_PITCH_M
-        return centre_m(place, self.source(place.reference).epsg) + np.array([east, north])
+        return np.array([east, north]) + centre_m(place, self.source(place.reference).epsg)
 
     def town(self, place: Place, town: int) -> Buildings:
         """A suburb; the first TOWNS are those of the reference, TOWNS_ALIKE of one design each."""
