@@ -27,8 +27,13 @@ class Bar:
         value: Any = sections[self.section]
         for part in self.figure.split("."):
             value = value.get(part) if isinstance(value, dict) else None
-        held = value is not None and (value >= self.limit if self.at_least else value <= self.limit)
-        return {"at least" if self.at_least else "at most": self.limit, "measured": value, "held": held}
+        return judged(value, self.limit, self.at_least)
+
+
+def judged(value: float | None, limit: float, at_least: bool = False) -> dict[str, Any]:
+    """Limit, measured, held; what was not measured (None) is not held."""
+    held = value is not None and (value >= limit if at_least else value <= limit)
+    return {"at least" if at_least else "at most": limit, "measured": value, "held": held}
 
 
 def judge(bars: Iterable[Bar], sections: dict[str, Scores]) -> Judged:

@@ -207,7 +207,7 @@ def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     group.add_argument(
         "--speed", nargs="*", metavar="MODEL",
-        help="time networks beside each other (none named: the shipped one)",
+        help="time networks beside each other (none named: the shipped ones)",
     )  # fmt: skip
     group.add_argument(
         "--write-errors", type=Path, metavar="FILE", help="measure the error model, write it here"
@@ -271,7 +271,7 @@ def run_eval(args: argparse.Namespace) -> int:
 
         cases = tuple(segmentation.parse_case(text) for text in args.cases) or segmentation.DEFAULT
         config = config_of(load(None, args.overrides), SEGMENTER, SegmenterConfig)
-        speed = () if args.speed is None else tuple(args.speed) or ("",)
+        speed = () if args.speed is None else tuple(args.speed) or ("", "int8")
         plan = segmentation.Plan(cases, config, args.seed, args.quick, speed, args.write_errors)
         print(segmentation.evaluate(args.out, plan, _stage))
     else:

@@ -13,6 +13,7 @@ from buildloc_msgs_py.errors import BuildlocError
 from buildloc_segmenter.config import SegmenterConfig
 from buildloc_segmenter.network import Network
 
+from buildloc_eval.bars import bar_table
 from buildloc_eval.html import write_report
 from buildloc_eval.instance_metrics import (
     HALF,
@@ -28,13 +29,15 @@ from buildloc_eval.overlapping import Overlap, flicker, overlaps
 from buildloc_eval.overlays import draw_windows, largest
 from buildloc_eval.places import Scene, overlap, patches, place
 from buildloc_eval.realworld import data_folder
+from buildloc_eval.segmentation_bars import case_bars, speed_bars
 from buildloc_eval.segmentation_errors import POOLED, SegmentationErrors, measured, summary, write_errors
-from buildloc_eval.segmented import SCORED_GSD_M, Scored, busiest, disturbed, score
-from buildloc_eval.speed import frame_jpeg, speed, speed_table
+from buildloc_eval.segmented import MAPPED_AREA_M2, SCORED_GSD_M, Scored, busiest, disturbed, score
+from buildloc_eval.speed import TRAINING_KEY, frame_jpeg, speed, speed_table
 
 Progress = Callable[[str], None]
 
-TRAINING_KEY = "buildloc_training"  # of the ONNX file's metadata: JSON with the places that trained it
+EXPORT = "export.json"  # beside a network, as training/export.py writes it
+KINDS = ("instances", "plain", "wire", "mapped")
 ONE_ZOOM = 20  # of web tiles: the zooms of a place show the same ground
 DISTURBED_SIDE_M = 250.0
 QUICK_SIDE_M = 320.0  # four frames overlap on it
@@ -48,6 +51,7 @@ RULES = {
     "not counted": f"below {MIN_AREA_M2:g} m2, cut by the edge of the labelled ground, found on such a one",
     "plain": "connected components of the same pixels, without separation of instances",
     "wire": "connected components of the mask that the mapper receives",
+    "mapped": f"the same, buildings of at least {MAPPED_AREA_M2:g} m2 alone, which a map holds",
 }
 
 
@@ -126,14 +130,26 @@ def failures(scored: Scored) -> dict[str, list[dict[str, Any]]]:
 
 
 def scores_of(parts: Sequence[Scored]) -> dict[str, Any]:
-    """Figures of the segmenter's instances, of plain components, and of the mask on the wire; the merged
-    buildings of the first over those of the second, None when plain components merge none."""
+    """Figures of the segmenter's instances, of plain components, of the mask on the wire and of what a map
+    holds of it; the merged buildings of the first over those of the second, None when plain components merge
+    none."""
     scores: dict[str, Any] = {
-        name: figures(pooled([getattr(part, name) for part in parts]))
-        for name in ("instances", "plain", "wire")
+        name: figures(pooled([getattr(part, name) for part in parts])) for name in KINDS
     }
     merged, plainly = scores["instances"]["merged"], scores["plain"]["merged"]
     return scores | {"merged over plain": merged / plainly if plainly else None}
+
+
+def parity(path: Path) -> dict[str, float] | None:
+    """How far PyTorch and ONNX Runtime agreed when a network was exported; None: its folder does not say."""
+    report = path.with_name(EXPORT)
+    if path.name != "model.onnx" or not report.is_file():
+        return None
+    try:
+        found: dict[str, float] = json.loads(report.read_text())["torch_against_onnx"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise EvaluationError(f"{report}: holds no torch_against_onnx; export the network again") from error
+    return found
 
 
 def robustness(network: Network, scene: Scene, progress: Progress) -> dict[str, Any]:
@@ -197,6 +213,7 @@ def run_case(case: Case, plan: Plan, imagery: Path, out: Path, progress: Progres
         "all scenes": scores_of(everything),
         "scenes": scenes,
         "disturbed input": robustness(network, widest, progress),
+        "torch against onnx": parity(network.path),
     }
     return CaseResult(report, pictures, pooled([part.wire for part in everything]), frames)
 
@@ -234,6 +251,9 @@ def evaluate(out: Path, plan: Plan, progress: Progress) -> str:
     if plan.speed:
         progress("speed")
         speeds = speed(frame_jpeg(imagery), plan.speed, plan.config)
+    bars = speed_bars(speeds)
+    for result in results:
+        bars |= case_bars(result.report)
     report = {
         "evaluation": "segmentation",
         "what is real": REAL,
@@ -243,6 +263,7 @@ def evaluate(out: Path, plan: Plan, progress: Progress) -> str:
         "quick": plan.quick,
         "how it is counted": RULES,
         **machine(),
+        "bars": bars,
         "speed": speeds,
         "error model": {name: asdict(values) for name, values in errors.items()},
         "cases": {f"{r.report['place']}, {r.report['model']}": r.report for r in results},
@@ -257,7 +278,8 @@ def evaluate(out: Path, plan: Plan, progress: Progress) -> str:
         }
         about = {key: report[key] for key in ("what is real", "seed", "quick", "date")}
         write_errors(plan.errors, about | {"network, place: what trained it": names}, errors)
-    return "\n".join([table([r.report for r in results]), *speed_table(speeds), *summary(errors)])
+    lines = [table([r.report for r in results]), *speed_table(speeds), *summary(errors), bar_table(bars)]
+    return "\n".join(lines)
 
 
 COLUMNS = (
@@ -285,7 +307,7 @@ def table(reports: Sequence[dict[str, Any]]) -> str:
         groups = report["scenes"] | ({"all": report["all scenes"]} if len(report["scenes"]) > 1 else {})
         for scene, values in groups.items():
             name = f"{report['place']}, {scene}" if scene != report["place"] else scene
-            lines += [row(name, kind, values[kind]) for kind in ("instances", "plain", "wire")]
+            lines += [row(name, kind, values[kind]) for kind in KINDS]
             if values["merged over plain"] is not None:
                 lines.append(f"  merged over plain: {values['merged over plain']:.2f}")
         for kind, values in report["disturbed input"].items():

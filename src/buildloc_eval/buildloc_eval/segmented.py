@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from buildloc_mapper.config import MapperConfig
 from buildloc_msgs_py.types import ByteArray
 from buildloc_segmenter.instances import draw_mask, fill_holes
 from buildloc_segmenter.network import Network
@@ -14,6 +15,7 @@ from buildloc_segmenter.network import Network
 from buildloc_eval.instance_metrics import MIN_AREA_M2, Comparison, compare
 from buildloc_eval.places import Labels, Scene
 
+MAPPED_AREA_M2 = MapperConfig().min_area_m2
 SCORED_GSD_M = 0.2  # truth and finds are compared on this raster, whatever the image's
 
 
@@ -79,27 +81,30 @@ def bgr(scene: Scene) -> ByteArray:
 
 @dataclass(frozen=True)
 class Scored:
-    """A piece of ground on the raster of the truth, what was found on it, and the comparison of each."""
+    """A piece of ground on the raster of the truth, what was found on it, and the comparison of each.
+
+    ``mapped`` is that of ``wire`` without the buildings, found or true, that are too small for a map.
+    """
 
     truth: Scene
     finds: Finds
     instances: Comparison
     plain: Comparison
     wire: Comparison
+    mapped: Comparison
 
 
 def score(network: Network, scene: Scene) -> Scored:
     """A connected piece of ground, its picture as it comes."""
     truth = scene.resampled(SCORED_GSD_M)
     finds = find(network, bgr(scene), scene.gsd_m, truth.labelled.shape)
-    return Scored(
-        truth, finds, *(against(truth, side) for side in (finds.instances, finds.plain, finds.wire))
-    )
+    instances, plain, wire = (against(truth, side) for side in (finds.instances, finds.plain, finds.wire))
+    return Scored(truth, finds, instances, plain, wire, against(truth, finds.wire, MAPPED_AREA_M2))
 
 
-def against(truth: Scene, found: Labels) -> Comparison:
+def against(truth: Scene, found: Labels, min_area_m2: float = MIN_AREA_M2) -> Comparison:
     """Compare with the truth, both on its raster."""
-    return compare(truth.buildings, found, truth.labelled, truth.gsd_m)
+    return compare(truth.buildings, found, truth.labelled, truth.gsd_m, min_area_m2)
 
 
 def busiest(scene: Scene, side_m: float) -> Scene:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from buildloc_eval.bars import Judged, bar_table
 from buildloc_eval.cli import add_eval_arguments, run_eval
 from buildloc_eval.flight import FlightConfig
 from buildloc_eval.observation import Sensing, sensing
@@ -16,7 +19,16 @@ from buildloc_eval.overlapping import SceneSurface, Seen, centres, frame, overla
 from buildloc_eval.overlays import overlay, rim, windows
 from buildloc_eval.places import Scene, patches
 from buildloc_eval.places import overlap as share_ground
-from buildloc_eval.segmentation import Case, EvaluationError, parse_case, refuse_known_ground, table
+from buildloc_eval.segmentation import (
+    KINDS,
+    Case,
+    EvaluationError,
+    parity,
+    parse_case,
+    refuse_known_ground,
+    table,
+)
+from buildloc_eval.segmentation_bars import case_bars, speed_bars
 from buildloc_eval.segmentation_errors import read_errors
 from buildloc_eval.segmented import busiest, disturbed, find, score
 from buildloc_msgs_py.errors import BuildlocError
@@ -37,7 +49,7 @@ class Bright:
             for n, full in zip(size, image.shape[:2], strict=True)
         )
         logits = np.where(image[np.ix_(rows, columns)][:, :, 0] > 127, 4.0, -4.0).astype(np.float32)
-        return find_instances(logits, None, NETWORK_GSD_M, 8.0, gsd_m)
+        return find_instances(logits, None, NETWORK_GSD_M, 8.0, 0.5, gsd_m)
 
     def blocks(self, image: np.ndarray, gsd_m: float) -> Iterator[tuple[Block, Instances]]:
         for block in blocks(*image.shape[:2], round(90.0 / gsd_m), round(30.0 / gsd_m)):
@@ -71,7 +83,7 @@ def village(height_m: float = 160.0, width_m: float = 220.0, gsd_m: float = 0.4)
 
 def test_the_blocks_of_a_scene_are_laid_together_on_the_raster_of_the_truth() -> None:
     scored = score(BRIGHT, village())
-    for result in (scored.instances, scored.plain, scored.wire):
+    for result in (scored.instances, scored.plain, scored.wire, scored.mapped):
         assert len(result.true) == len(result.found) == result.true.matched_strict.sum()
         assert not result.true.merged.any() and not result.true.split.any()
         assert np.abs(result.pairs.centroid_m).max() < 0.15
@@ -180,7 +192,7 @@ def test_the_table_has_a_row_for_each_scene_and_way_of_counting() -> None:
         ("pixel_iou", "pixel_f1", "recall_0.5", "precision_0.5", "recall_0.3", "precision_0.3", "merged",
          "split", "missed", "centroid_median_m", "outline_m", "false_per_km2"), 0.5,
     )  # fmt: skip
-    kinds: dict[str, Any] = dict.fromkeys(("instances", "plain", "wire"), values | {"centroid_p90_m": None})
+    kinds: dict[str, Any] = dict.fromkeys(KINDS, values | {"centroid_p90_m": None})
     kinds |= {"merged over plain": 0.25}
     report = {
         "place": "banepa", "model": "net.onnx", "trained on": {"places": ["zanzibar"]}, "all scenes": kinds,
@@ -188,6 +200,68 @@ def test_the_table_has_a_row_for_each_scene_and_way_of_counting() -> None:
         "disturbed input": {"as it comes": {"pixel_iou": 0.7}, "low": {"pixel_iou": 0.6, "falls_by": 0.1}},
     }  # fmt: skip
     text = table([report])
-    assert text.startswith("imagery: real") and text.count("banepa, ") == 9
+    assert text.startswith("imagery: real") and text.count("banepa, ") == 12
     assert text.count("merged over plain: 0.25") == 3
     assert "low: IoU 0.600, falls by 0.100" in text and "zanzibar" in text
+
+
+def test_what_a_map_leaves_out_counts_for_nothing_in_its_row() -> None:
+    scene = village()
+    sheds = scene.buildings.copy()
+    sheds[60:70, 60:70] = sheds.max() + 1  # 16 m2 that nobody finds
+    scored = score(BRIGHT, replace(scene, buildings=sheds))
+    assert scored.wire.true.lost.sum() == 1 and not scored.mapped.true.lost.any()
+
+
+def case_report(place: str, trained: list[str], **figures: float) -> dict[str, Any]:
+    """The part of a report that is judged: all figures good but those given."""
+    good = {"pixel_iou": 0.9, "recall_0.3": 0.98, "precision_0.3": 0.95, "centroid_median_m": 0.3,
+            "centroid_p90_m": 1.0}  # fmt: skip
+    return {
+        "place": place, "model": "net.onnx", "trained on": {"places": trained},
+        "all scenes": {"instances": good | figures},
+        "scenes": {"banepa_ortho": {"merged over plain": figures.get("merged", 0.3)}},
+        "disturbed input": {"as it comes": {"pixel_iou": 0.7}, "low": {"falls_by": figures.get("fall", 0.01)},
+                            "high": {"falls_by": -0.01}},
+        "torch against onnx": {"equal_mask_share": 0.9995},
+    }  # fmt: skip
+
+
+def missed(bars: Judged) -> list[str]:
+    return [what.split(": ")[-1] for what, bar in bars.items() if not bar["held"]]
+
+
+def test_a_network_is_judged_by_the_bars_of_its_place() -> None:
+    assert len(case_bars(case_report("barnarp", ["banepa"]))) == 6
+    assert not missed(case_bars(case_report("barnarp", ["banepa"])))
+    weak = {"precision_0.3": 0.79, "centroid_median_m": 0.81, "fall": 0.06}
+    fell = "IoU of disturbed input falls by"
+    assert missed(case_bars(case_report("barnarp", ["banepa"], **weak))) == [*list(weak)[:2], fell]
+    # The east half asks for more of a network that has seen the west half.
+    for trained, asked in ((["banepa"], []), (["banepa", "barnarp_west"], ["recall_0.3", "centroid_p90_m"])):
+        report = case_report("barnarp_east", trained, **{"recall_0.3": 0.9, "centroid_p90_m": 2.0})
+        assert missed(case_bars(report)) == asked
+    assert missed(case_bars(case_report("banepa", ["zanzibar"], merged=0.4))) == ["merged over plain"]
+    assert [
+        bar.get("at most", bar.get("at least")) for bar in case_bars(case_report("zanzibar", [])).values()
+    ] == [0.05, 0.999]
+    nothing = case_report("barnarp", []) | {"torch against onnx": None}
+    nothing["all scenes"]["instances"]["centroid_median_m"] = None
+    assert missed(case_bars(nothing)) == ["centroid_median_m"]
+    assert bar_table(case_bars(nothing)).count("MISSED") == 1
+
+
+def test_the_quantised_network_has_its_own_bar_of_time() -> None:
+    one: dict[str, Any] = {"ms_total": 60.0, "peak_memory_mb": 300.0, "quantised": False}
+    speeds = {"load average": 0.1, "frame": "1280x720", "shipped": one, "int8": one | {"quantised": True}}
+    assert missed(speed_bars(speeds)) == ["ms a frame"] and len(speed_bars(speeds)) == 4
+
+
+def test_the_agreement_with_pytorch_is_that_of_the_export(tmp_path: Path) -> None:
+    assert parity(tmp_path / "model.onnx") is None
+    (tmp_path / "export.json").write_text(json.dumps({"torch_against_onnx": {"equal_mask_share": 1.0}}))
+    assert parity(tmp_path / "model.onnx") == {"equal_mask_share": 1.0}
+    assert parity(tmp_path / "model_int8.onnx") is None  # it was not what was compared
+    (tmp_path / "export.json").write_text("{}")
+    with pytest.raises(EvaluationError, match="export the network again"):
+        parity(tmp_path / "model.onnx")

@@ -23,7 +23,7 @@ MIN_CORE_M2 = 1.0  # smaller ones are noise: a shed of 8 m2 has a core of 2.6 m2
 # across corners connected: anything narrower than 0.25 m times the root of two would leak there.
 GAP_M = 0.4
 GAP_PX = 1.5  # of the image: its own neighbours across corners
-GROUND = 1  # the watershed's marker of what is no building
+GROUND = 1  # the watershed's mark of what is no building
 SQUARE = np.ones((3, 3), np.uint8)
 MAX_LOGIT = 4.0  # beyond it a pixel is as sure as its neighbour: edges stay in the middle between two
 
@@ -50,25 +50,38 @@ class Instances:
         return np.clip(np.abs(self.building), 0.5, MAX_LOGIT)
 
 
+def probability(logits: FloatImage) -> FloatImage:
+    """Of logits, of any shape."""
+    return np.asarray(1.0 / (1.0 + np.exp(-np.clip(logits, -60.0, 60.0))), dtype=np.float32)
+
+
 def find_instances(
-    building: FloatImage, core: FloatImage | None, gsd_m: float, min_area_m2: float, image_gsd_m: float
+    building: FloatImage,
+    core: FloatImage | None,
+    gsd_m: float,
+    min_area_m2: float,
+    min_score: float,
+    image_gsd_m: float,
 ) -> Instances:
     """Split a building score (h, w) into buildings, by the score of their cores where there is one.
 
     A core is what lies well inside one building; touching roofs have separate ones. Each grows in its
     connected part of the mask until it meets the next. A part without a core is one building. Holes and
-    buildings below ``min_area_m2`` are removed. ``image_gsd_m`` is that of the image the mask is for.
+    buildings below ``min_area_m2`` are removed, and buildings whose pixels have a mean probability below
+    ``min_score``. ``image_gsd_m`` is that of the image the mask is for.
     """
     min_px = min_area_m2 / gsd_m**2
-    mask = fill_holes((building > 0.0).astype(np.uint8), min_px)
-    cores = _cores(mask, core, gsd_m)
-    grown = _flood(mask, _markers(mask, cores, MIN_CORE_M2 / gsd_m**2))
-    kept = np.bincount((grown * mask).ravel()) >= max(min_px, 1.0)
+    mask = fill_holes((building > 0.0).view(np.uint8), min_px)
+    labels = _separated(mask, _cores(mask, core, gsd_m), MIN_CORE_M2 / gsd_m**2)
+    inside = mask.view(np.bool_)
+    numbers = labels[inside]
+    pixels = np.bincount(numbers, minlength=1)
+    score = np.bincount(numbers, probability(building[inside]), len(pixels)) / np.maximum(pixels, 1)
+    kept = (pixels >= max(min_px, 1.0)) & (score >= min_score)
     kept[0] = False
-    grown = np.take(np.where(kept, np.cumsum(kept), 0).astype(np.int32), grown)
+    labels[inside] = np.where(kept, np.cumsum(kept), 0).astype(np.int32)[numbers]
     gap_m = max(GAP_M, GAP_PX * image_gsd_m)
-    between = _between(grown, max(1, round(0.5 * gap_m / gsd_m)))
-    return Instances(grown * mask, building, between, gsd_m)
+    return Instances(labels, building, _between(labels, max(1, round(0.5 * gap_m / gsd_m))), gsd_m)
 
 
 def _cores(mask: ByteArray, core: FloatImage | None, gsd_m: float) -> ByteArray:
@@ -85,48 +98,62 @@ def _components(mask: ByteArray, connectivity: int) -> tuple[int, LabelImage]:
     return count, np.asarray(labels, dtype=np.int32)
 
 
-def _markers(mask: ByteArray, cores: ByteArray, min_core_px: float) -> LabelImage:
-    """(h, w) 0 where the watershed decides, else a number above GROUND per building to be."""
-    count, markers = _components(cores, 4)
-    number = np.arange(count, dtype=np.int32) + GROUND
-    number[np.bincount(markers.ravel(), minlength=count) < min_core_px] = 0
-    number[0] = 0
-    markers = np.take(number, markers)
+def _separated(mask: ByteArray, cores: ByteArray, min_core_px: float) -> LabelImage:
+    """(h, w) 0 outside of the mask, inside a number above 0 for each building.
+
+    Only where a connected part of the mask holds several cores has the watershed anything to decide.
+    """
     parts, part = _components(mask, 8)
-    bare = np.arange(parts, dtype=np.int32) + (count + GROUND)
-    bare[np.bincount((part * (markers > 0)).ravel(), minlength=parts) > 0] = 0
-    bare[0] = 0
-    return np.maximum(markers, np.take(bare, part)) if bare.any() else markers
+    count, core = _components(cores, 4)
+    at = np.flatnonzero(cores.view(np.bool_))
+    numbers = core.ravel()[at]
+    large = np.bincount(numbers, minlength=count) >= min_core_px
+    large[0] = False
+    home = np.zeros(count, np.int32)
+    home[numbers] = part.ravel()[at]  # all of a core lies in one part
+    shared = np.bincount(home[large], minlength=parts) > 1
+    if not shared.any():
+        return part
+    disputed = np.take(shared, part).view(np.uint8)
+    seeds = np.zeros_like(part)
+    seeds.ravel()[at] = np.where(large & shared[home], np.arange(count) + parts, 0).astype(np.int32)[numbers]
+    return np.where(disputed > 0, _flooded(disputed, seeds), part)
 
 
-def _flood(mask: ByteArray, markers: LabelImage) -> LabelImage:
-    """(h, w) the markers, less GROUND, grown over the mask and one pixel around it."""
-    # OpenCV draws its line around the image too: a pixel more on each side is there for that.
+def _flooded(mask: ByteArray, seeds: LabelImage) -> LabelImage:
+    """(h, w) the seeds, above GROUND, grown over the mask; outside of it anything."""
+    # OpenCV draws its line around the image and around what it fills: a pixel more is there for that.
     region = cv2.copyMakeBorder(cv2.dilate(mask, SQUARE), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
-    seeds = np.where(region > 0, np.pad(markers, 1), np.int32(GROUND))
-    # OpenCV floods across small differences first: the markers share the mask before the ground enters it.
-    cv2.watershed(cv2.cvtColor(region * np.uint8(255), cv2.COLOR_GRAY2BGR), seeds)
-    labels = np.maximum(seeds - GROUND, 0).astype(np.float32)  # OpenCV dilates no int32
-    filled = np.where((seeds < 0) & (region > 0), cv2.dilate(labels, SQUARE), labels)
-    return filled[1:-1, 1:-1].astype(np.int32)
+    labels = cv2.copyMakeBorder(seeds, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
+    labels[region == 0] = GROUND
+    # OpenCV floods across small differences first: the seeds share the mask before the ground enters it.
+    cv2.watershed(cv2.cvtColor(region * np.uint8(255), cv2.COLOR_GRAY2BGR), labels)
+    line = labels < 0
+    labels[line] = cv2.dilate(labels.astype(np.float32), SQUARE)[line]  # OpenCV dilates no int32
+    return np.asarray(labels[1:-1, 1:-1], dtype=np.int32)
 
 
 def _between(labels: LabelImage, reach_px: int) -> NDArray[np.bool_]:
-    """(h, w) pixels within reach of another building."""
+    """(h, w) pixels within reach of another building, or of the pixel of ground around it."""
     kernel = np.ones((2 * reach_px + 1, 2 * reach_px + 1), np.uint8)
-    values = labels.astype(np.float32)
-    low = cv2.erode(np.where(labels > 0, values, np.float32(np.inf)), kernel)
+    values = labels.astype(np.float32)  # OpenCV dilates no int32
+    values = np.where(labels > 0, values, cv2.dilate(values, SQUARE))
+    low = cv2.erode(np.where(values > 0.0, values, np.float32(np.inf)), kernel)
     return cv2.dilate(values, kernel) > low
 
 
 def fill_holes(mask: ByteArray, max_px: float) -> ByteArray:
     """(h, w) 0 or 1, with the holes below ``max_px`` filled: background that is enclosed by building."""
-    count, labels = _components(1 - mask, 4)
-    hole = (np.bincount(labels.ravel(), minlength=count) < max_px).astype(np.uint8)
-    for border in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
-        hole[border] = 0
-    hole[0] = 0
-    return mask | np.take(hole, labels) if hole.any() else mask
+    contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    if not contours:
+        return mask
+    # A hole's contour runs through the building's pixels around it. Pick: it encloses A - B / 2 + 1 others.
+    holes = [
+        contour
+        for contour, (*_, parent) in zip(contours, hierarchy[0], strict=True)
+        if parent >= 0 and cv2.contourArea(contour) - len(contour) / 2 + 1 < max_px
+    ]
+    return np.asarray(cv2.drawContours(mask.copy(), holes, -1, 1, cv2.FILLED), dtype=np.uint8)
 
 
 def draw_mask(instances: Instances, size: tuple[int, int]) -> ByteArray:
@@ -134,7 +161,7 @@ def draw_mask(instances: Instances, size: tuple[int, int]) -> ByteArray:
     inside = (instances.labels > 0) & ~instances.between
     margin = instances.margin()
     field = cv2.resize(np.where(inside, margin, -margin), size, interpolation=cv2.INTER_LINEAR)
-    return (field > 0.0).astype(np.uint8) * np.uint8(255)
+    return (field > 0.0).view(np.uint8) * np.uint8(255)
 
 
 def owned(instances: Instances, window: tuple[float, float, float, float]) -> Instances:

@@ -19,7 +19,14 @@ from buildloc_msgs_py.types import ByteArray
 
 from buildloc_segmenter.config import SegmenterConfig
 from buildloc_segmenter.contract import METADATA_KEY, contract_from_json, contract_of
-from buildloc_segmenter.instances import FloatImage, Instances, draw_mask, find_instances, owned
+from buildloc_segmenter.instances import (
+    FloatImage,
+    Instances,
+    draw_mask,
+    find_instances,
+    owned,
+    probability,
+)
 from buildloc_segmenter.outlines import Building, buildings
 from buildloc_segmenter.tiles import Block, blocks, starts
 
@@ -140,7 +147,9 @@ class Network:
         """The buildings of an image (H, W, 3), as one block, at the network's ground sampling distance."""
         config, scores = self._config, self.scores(image_bgr, gsd_m)
         building = scores.building - np.float32(math.log(config.threshold / (1.0 - config.threshold)))
-        return find_instances(building, scores.core, scores.gsd_m, config.min_component_m2, gsd_m)
+        return find_instances(
+            building, scores.core, scores.gsd_m, config.min_component_m2, config.min_score, gsd_m
+        )
 
     def scores(self, image_bgr: ByteArray, gsd_m: float) -> Scores:
         """(H, W, 3) uint8 BGR at ``gsd_m`` metres per pixel -> logits at the network's."""
@@ -161,7 +170,7 @@ class Network:
         """(H, W, 3) uint8 BGR -> (H, W) float32 building probability."""
         logits = self.scores(image_bgr, gsd_m).building
         upsampled = cv2.resize(logits, image_bgr.shape[1::-1], interpolation=cv2.INTER_LINEAR)
-        return np.asarray(1.0 / (1.0 + np.exp(-np.clip(upsampled, -60.0, 60.0))), dtype=np.float32)
+        return probability(np.asarray(upsampled, dtype=np.float32))
 
     def _wrong(self, parameters: str, found: str = "") -> NetworkError:
         """What this contract expects of a file, what the file has, and what to put right."""

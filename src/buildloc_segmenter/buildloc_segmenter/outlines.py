@@ -15,7 +15,7 @@ from shapely.affinity import affine_transform, translate
 from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 
-from buildloc_segmenter.instances import Instances
+from buildloc_segmenter.instances import Instances, probability
 
 FINER = 4  # outlines are traced on a raster so much finer than the labels
 SIMPLIFY_M = 0.5  # how far an outline may lie from the traced one
@@ -68,8 +68,7 @@ def buildings(instances: Instances, pixel_m: float) -> list[Building]:
         if outline is None:
             continue
         placed = affine_transform(outline, [scale, 0.0, 0.0, scale, (left - 1) * scale, (top - 1) * scale])
-        logits = np.clip(building[window][inside], -60.0, 60.0)
-        score = float(np.mean(1.0 / (1.0 + np.exp(-logits))))
+        score = float(np.mean(probability(building[window][inside])))
         found.append(Building(placed, placed.area * pixel_m**2, score))
     return found
 

@@ -20,8 +20,10 @@ def scores(*boxes: Box, inset: int = 0, size: tuple[int, int] = (80, 120)) -> np
     return image
 
 
-def found(building: np.ndarray, core: np.ndarray | None = None, min_area_m2: float = 8.0) -> Instances:
-    return find_instances(building, core, GSD_M, min_area_m2, image_gsd_m=0.1)
+def found(
+    building: np.ndarray, core: np.ndarray | None = None, min_area_m2: float = 8.0, min_score: float = 0.5
+) -> Instances:
+    return find_instances(building, core, GSD_M, min_area_m2, min_score, image_gsd_m=0.1)
 
 
 def parts(mask: np.ndarray) -> int:
@@ -71,7 +73,7 @@ def test_what_is_finer_than_the_inset_of_a_core_splits_nothing() -> None:
 @pytest.mark.parametrize(("zoom", "gap_m"), [(2.0, 0.4), (1.0, 0.4), (0.4, 0.75)])
 def test_the_mask_keeps_touching_buildings_apart_at_any_size(zoom: float, gap_m: float) -> None:
     pixel_m = GSD_M / zoom
-    instances = find_instances(scores(*TERRACE), scores(*TERRACE, inset=3), GSD_M, 8.0, pixel_m)
+    instances = find_instances(scores(*TERRACE), scores(*TERRACE, inset=3), GSD_M, 8.0, 0.5, pixel_m)
     height, width = (round(side * zoom) for side in instances.labels.shape)
     mask = draw_mask(instances, (width, height))
     assert mask.shape == (height, width) and set(np.unique(mask)) == {0, 255}
@@ -102,6 +104,20 @@ def test_small_buildings_and_holes_go_and_the_numbers_stay_without_gaps() -> Non
     assert mask[21, 21] == 255 and mask[12, 62] == 0 and (mask > 0).sum() == 1800
 
 
+def test_a_building_that_the_network_doubts_goes_and_its_neighbour_stays() -> None:
+    image = scores((10, 10, 40, 40), (40, 10, 70, 40), (80, 10, 110, 40))
+    image[10:40, 40:70] = 1.0  # a probability of 0.73: a terrace at the house
+    image[10:40, 80:110] = 1.0  # and a shed of which half is sure: 0.86
+    image[10:40, 95:110] = 5.0
+    core = np.where(scores((10, 10, 40, 40), inset=3) > scores((40, 10, 70, 40), inset=3), 5.0, -5.0)
+    core[13:37, 43:67] = core[13:37, 83:107] = 5.0
+    for min_score, numbers in ((0.7, {0, 1, 2, 3}), (0.75, {0, 1, 2}), (0.9, {0, 1})):
+        instances = found(image, core.astype(np.float32), min_score=min_score)
+        assert set(np.unique(instances.labels)) == numbers and instances.labels[25, 25] > 0
+    assert instances.labels[25, 55] == 0 and not instances.between.any()
+    assert parts(draw_mask(instances, (120, 80))) == 1
+
+
 def test_only_enclosed_background_is_a_hole() -> None:
     # Close to the ground the whole picture is smaller than the smallest building: it stays empty.
     assert fill_holes(np.zeros((40, 60), dtype=np.uint8), 1e6).max() == 0
@@ -116,6 +132,54 @@ def test_an_image_of_ground_and_one_of_roof() -> None:
     assert len(found(np.full((40, 60), -5.0, dtype=np.float32))) == 0
     roof = found(np.full((40, 60), 5.0, dtype=np.float32))
     assert len(roof) == 1 and draw_mask(roof, (60, 40)).min() == 255
+
+
+def plain_holes(mask: np.ndarray, max_px: float) -> np.ndarray:
+    """Filled holes by the definition: each component of the background on its own."""
+    filled = mask.copy()
+    parts, part = cv2.connectedComponents(1 - mask, connectivity=4)
+    border = np.unique(np.concatenate([part[0], part[-1], part[:, 0], part[:, -1]]))
+    for number in set(range(1, parts)) - set(border.tolist()):
+        if (part == number).sum() < max_px:
+            filled[part == number] = 1
+    return filled
+
+
+def plain_instances(mask: np.ndarray, cores: np.ndarray, min_core_px: float, min_px: float) -> np.ndarray:
+    """Instances by the definition: a pixel belongs to the core closest to it in its part of the mask."""
+    labels = np.zeros(mask.shape, dtype=np.int32)
+    parts, part = cv2.connectedComponents(mask, connectivity=8)
+    for number in range(1, parts):
+        inside = (part == number).astype(np.uint8)
+        count, core = cv2.connectedComponents(cores & inside, connectivity=4)
+        large = [k for k in range(1, count) if (core == k).sum() >= min_core_px]
+        grown = np.where(np.isin(core, large), core, 0) if large else inside.astype(np.int32)
+        while (inside.astype(bool) & (grown == 0)).any():
+            wider = cv2.dilate(grown.astype(np.float32), np.ones((3, 3), np.uint8)).astype(np.int32)
+            grown = np.where((grown == 0) & (inside > 0), wider, grown)
+        for k in set(np.unique(grown).tolist()) - {0}:
+            if (grown == k).sum() >= max(min_px, 1.0):
+                labels[grown == k] = labels.max() + 1
+    return labels
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_fast_way_finds_what_the_definition_says(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    noise = cv2.GaussianBlur(rng.normal(0.0, 40.0, (120, 160)).astype(np.float32), (0, 0), 3.0)
+    mask = (noise > 0.0).astype(np.uint8)
+    filled = fill_holes(mask, 60.0)
+    # An island in a hole counts for the hole, in the definition it does not: a few pixels.
+    assert (filled != plain_holes(mask, 60.0)).mean() < 2e-3
+    core = np.where(noise > 1.5, 5.0, -5.0).astype(np.float32)
+    instances = found(np.where(filled > 0, 5.0, -5.0).astype(np.float32), core, 2.4)
+    smooth = cv2.GaussianBlur(core, (0, 0), 0.6 / GSD_M) > 0.0
+    plain = plain_instances(filled, filled & smooth.astype(np.uint8), 25.0, 60.0)
+    assert len(instances) == plain.max() > 5
+    # Which of two cores is closer is a tie along the line between them, and the flood goes along the axes.
+    _, pixels = np.unique(np.stack([instances.labels, plain])[:, plain > 0], axis=1, return_counts=True)
+    assert np.sort(pixels)[-plain.max() :].sum() > 0.97 * pixels.sum()
+    assert ((instances.labels > 0) == (plain > 0)).mean() > 0.995
 
 
 @pytest.mark.parametrize("turns", [1, 2, 3])

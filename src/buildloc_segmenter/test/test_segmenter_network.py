@@ -105,7 +105,7 @@ def test_two_classes_of_probability(tmp_path: Path) -> None:
 
 def test_one_class_of_probability_and_the_threshold(tmp_path: Path) -> None:
     model = save_graph(tmp_path / "net.onnx", np.zeros(3), [0.0], 1, tail="Sigmoid")
-    config = replace(PLAIN, model=model, output="probability")
+    config = replace(PLAIN, model=model, output="probability", min_score=0.0)
     image, _ = scene()
     assert Network(replace(config, threshold=0.45)).segment(image, 0.2).min() == 255
     assert Network(replace(config, threshold=0.55)).segment(image, 0.2).max() == 0

@@ -40,7 +40,7 @@ def centred(outline: Polygon, angle_deg: float = 0.0) -> Polygon:
 
 def traced(outline: Polygon, pixel_m: float = 0.1) -> Building:
     """The one building found in a drawing."""
-    (building,) = buildings(find_instances(drawn(outline), None, GSD_M, 8.0, pixel_m), pixel_m)
+    (building,) = buildings(find_instances(drawn(outline), None, GSD_M, 8.0, 0.5, pixel_m), pixel_m)
     return building
 
 
@@ -104,7 +104,7 @@ def test_touching_roofs_have_one_outline_each_and_share_a_wall() -> None:
     left, right = (Polygon([(x, 8), (x + 8, 8), (x + 8, 18), (x, 18)]) for x in (6.0, 14.0))
     core = np.maximum(drawn(left.buffer(-0.6)), drawn(right.buffer(-0.6)))
     both = np.maximum(drawn(left), drawn(right))
-    found = [metres(b) for b in buildings(find_instances(both, core, GSD_M, 8.0, 0.1), 0.1)]
+    found = [metres(b) for b in buildings(find_instances(both, core, GSD_M, 8.0, 0.5, 0.1), 0.1)]
     assert len(found) == 2
     assert all(max(iou(outline, true) for outline in found) > 0.95 for true in (left, right))
 
@@ -118,5 +118,5 @@ def test_the_score_is_the_mean_probability() -> None:
 def traced_score(logit: float) -> float:
     field = np.full((60, 60), -5.0, dtype=np.float32)
     field[10:50, 10:50] = logit
-    (building,) = buildings(find_instances(field, None, GSD_M, 8.0, 0.2), 0.2)
+    (building,) = buildings(find_instances(field, None, GSD_M, 8.0, 0.5, 0.2), 0.2)
     return building.score
