@@ -119,7 +119,6 @@ class MapperNode(Node):  # type: ignore[misc]
         self._report(DiagnosticStatus.OK, "mapping", **update.funnel)
 
     def _refuse(self, error: BuildlocError) -> None:
-        """Go on without a frame."""
         self._refused += 1
         self.get_logger().warning(f"frame skipped: {error}", throttle_duration_sec=LOG_PERIOD_S)
         self._report(DiagnosticStatus.WARN, str(error))
