@@ -42,7 +42,7 @@ def test_the_worst_kind_counts_and_right_candidates_do_not() -> None:
     assert Tail(**found["tail"]).quantile(AT_RATE) > 30.0
 
 
-def test_a_kind_that_never_scores_has_the_scale_of_all() -> None:
+def test_a_kind_that_seldom_scores_has_the_largest_scale() -> None:
     records = pd.concat([wrong("outside", exponential(1, 500, 2.0)), wrong("mirrored", np.full(50, -np.inf))])
     assert calibrate(records)["kinds"]["mirrored"]["wrong"] == 50
     assert fit_tail(np.full(50, -np.inf), 3.0) == Tail(START_NATS, pytest.approx(0.058, abs=1e-3), 3.0)

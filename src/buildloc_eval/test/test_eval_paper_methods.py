@@ -255,8 +255,8 @@ def test_the_interval_of_a_mean_is_students() -> None:
 def test_convergence_is_over_flights_and_seeds_that_reach_it() -> None:
     ranks = (9, 1, 1)
     traces = [
-        Converged("default preset", 6, 1, "flight1", 2, 2, ranks, 2),
-        Converged("default preset", 6, 2, "flight1", 4, 6, ranks, 2),
+        Converged("default preset", 6, 1, "flight1", 2, 2, ranks, 2, 9),
+        Converged("default preset", 6, 2, "flight1", 4, 6, ranks, 2, 12),
         Converged("default preset", 6, 1, "flight2", 3, None, ranks, 2),
         Converged("default preset", 6, 2, "flight2", None, None, ranks, None),
     ]
@@ -264,6 +264,7 @@ def test_convergence_is_over_flights_and_seeds_that_reach_it() -> None:
     assert (row["flights"], row["first success"], row["stable success"]) == (4, 3.0, 4.0)
     assert (row["first success, flights"], row["stable success, flights"]) == (3, 2)
     assert row["first success_95%"] == mean_interval([2.5, 4.0])
+    assert (row["first accepted fix"], row["first accepted fix, flights"]) == (10.5, 2)
     assert row["by flight, first"] == "flight1: 3.0 (2 to 4), flight2: 3.0 (3 to 3)"
     assert row["by flight, stable"] == "flight1: 4.0 (2 to 6), flight2: never"
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
+import cv2
 from buildloc_msgs_py.config import check
 from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.ground import validate_frame
@@ -21,6 +23,15 @@ from buildloc_mapper.tracking import Lost, Tracker
 
 class MapperError(BuildlocError):
     """A keyframe cannot be added."""
+
+
+@contextmanager
+def _opencv_may_refuse() -> Iterator[None]:
+    """What OpenCV cannot work on is a frame that cannot be used, not the end of the flight."""
+    try:
+        yield
+    except cv2.error as error:
+        raise MapperError(f"OpenCV refuses the frame: {error.err}; check image and calibration") from error
 
 
 @dataclass(frozen=True)
@@ -59,13 +70,14 @@ class Mapper:
         self._latest: int | None = None  # keyframe of a map
         self._latest_stamp_ns: int | None = None
 
+    @_opencv_may_refuse()
     def add(self, frame: Frame, mask: Mask) -> MapUpdate | None:
         """Add a keyframe and its mask; the new map, or None when the keyframe links to nothing yet.
 
         Such a keyframe is kept: when a later one links to it, the two are a new map, which is joined to the
         earlier ones as soon as the same ground is seen again. Raises MapperError when frame and mask do not
-        belong together or the frame is not later than the one before, WireError for unusable telemetry; the
-        map is then as it was.
+        belong together, the frame is not later than the one before or OpenCV refuses it, WireError for
+        unusable telemetry; the map is then as it was.
         """
         validate_frame(frame)
         if mask.stamp_ns != frame.stamp_ns or mask.pixels.shape != frame.image_bgr.shape[:2]:
@@ -93,9 +105,11 @@ class Mapper:
         self._tracker.rebase(frame, self._atlas.prepared(keyframe), T_new_old)
         return update
 
+    @_opencv_may_refuse()
     def track(self, frame: Frame) -> Tracked | Lost:
         """Where a frame between keyframes is, in the latest keyframe of the map; may run while a keyframe is
-        added on another thread. Raises WireError for unusable telemetry."""
+        added on another thread. Raises WireError for unusable telemetry, MapperError where OpenCV refuses the
+        frame."""
         return self._tracker.track(frame)
 
     def finish(self) -> MapUpdate | None:

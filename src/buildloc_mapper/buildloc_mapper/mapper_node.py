@@ -25,6 +25,7 @@ from buildloc_mapper.config import MapperConfig
 from buildloc_mapper.mapper import Mapper, MapUpdate
 from buildloc_mapper.tracking import Lost
 
+LOG_PERIOD_S = 5.0  # of the same complaint
 FRAMES_KEPT = 100  # that wait for a mask; a busy segmenter may lag by seconds
 
 
@@ -40,7 +41,7 @@ class MapperNode(Node):  # type: ignore[misc]
         self._mapping, self._tracking = Worker(self, "map"), Worker(self, "track")
         self._untracked: Frame | None = None  # the newest frame, while another is tracked
         self._tracks = False
-        self._received = self._published = self._dropped = 0
+        self._received = self._published = self._dropped = self._refused = 0
         self._tracked = self._lost = self._skipped = 0
         self._map = self.create_publisher(PointCloud2, topics.MAP, qos.SENSOR)
         self._keyframes = self.create_publisher(Path, topics.KEYFRAMES, qos.SENSOR)
@@ -69,7 +70,7 @@ class MapperNode(Node):  # type: ignore[misc]
         try:
             answer = done.result()
         except BuildlocError as error:
-            self._report(DiagnosticStatus.WARN, str(error))
+            self._refuse(error)
         else:
             if isinstance(answer, Tracked):
                 self._track.publish(encode.encode_tracked(answer))
@@ -107,7 +108,7 @@ class MapperNode(Node):  # type: ignore[misc]
         try:
             update = done.result()
         except BuildlocError as error:
-            self._report(DiagnosticStatus.WARN, str(error))
+            self._refuse(error)
             return
         if update is None:
             self._report(DiagnosticStatus.WARN, "keyframe links to none of the latest keyframes")
@@ -117,10 +118,16 @@ class MapperNode(Node):  # type: ignore[misc]
         self._published += 1
         self._report(DiagnosticStatus.OK, "mapping", **update.funnel)
 
+    def _refuse(self, error: BuildlocError) -> None:
+        self._refused += 1
+        self.get_logger().warning(f"frame skipped: {error}", throttle_duration_sec=LOG_PERIOD_S)
+        self._report(DiagnosticStatus.WARN, str(error))
+
     def _report(self, level: bytes, message: str, **figures: float) -> None:
         counts = {
             "masks": self._received, "maps": self._published, "masks_without_image": self._dropped,
             "frames_tracked": self._tracked, "frames_lost": self._lost, "frames_skipped": self._skipped,
+            "frames_refused": self._refused,
         }  # fmt: skip
         self._diagnostics.report(level, message, **counts, **figures)
 

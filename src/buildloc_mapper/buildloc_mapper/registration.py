@@ -140,6 +140,12 @@ class Registration:
 
         ``turned_rad`` is the turn to try first by methods that know an up; None: the gimbal's.
         """
+        try:
+            return self._register(earlier, later, turned_rad)
+        except cv2.error:  # keyframes that are linked already must not be lost for this pair
+            return Rejection("opencv")
+
+    def _register(self, earlier: Prepared, later: Prepared, turned_rad: float | None) -> Link | Rejection:
         if min(len(earlier.corners_uv), len(later.corners_uv)) < self._config.min_inliers:
             return Rejection("few_matches")
         turned = turn_told(earlier.level, later.level) if turned_rad is None else turned_rad
@@ -155,7 +161,10 @@ class Registration:
         """The later image's pose in the earlier keyframe where it is known to some 15 pixels, by its corners
         alone: a fraction of the cost of :meth:`register`."""
         step = max(1, len(earlier.corners_uv) // FOLLOWED)
-        followed = self._refine(earlier.level, earlier.corners_uv[::step], later, rough)
+        try:
+            followed = self._refine(earlier.level, earlier.corners_uv[::step], later, rough)
+        except cv2.error:
+            return Rejection("opencv")
         if followed is None:
             return Rejection("few_inliers")
         return self._fitted(*followed, rough, len(followed[0]), earlier.level, later)

@@ -99,6 +99,24 @@ def test_a_keyframe_that_links_to_nothing_waits_for_one_that_links_to_it() -> No
     assert (update.funnel["submaps"], update.funnel["unlinked"]) == (1, 2)
 
 
+def test_a_frame_that_opencv_refuses_costs_that_frame_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise cv2.error("(-215:Assertion failed)")
+
+    mapper = Mapper(MapperConfig())
+    mapper.add(*FLIGHT[0])
+    with monkeypatch.context() as broken:
+        broken.setattr(cv2, "cvtColor", refuse)  # of every image that comes in
+        for call in (lambda: mapper.add(*FLIGHT[1]), lambda: mapper.track(FLIGHT[1][0])):
+            with pytest.raises(MapperError, match="OpenCV refuses the frame"):
+                call()
+    with monkeypatch.context() as broken:
+        broken.setattr(cv2, "estimateAffinePartial2D", refuse)  # of a pair, with the map half changed
+        assert mapper.add(*FLIGHT[2]) is None
+    update = mapper.add(*FLIGHT[3])
+    assert update is not None and update.funnel["rejected_opencv"] >= 1
+
+
 @pytest.mark.parametrize("stamp", [0, -5])
 def test_an_equal_or_earlier_stamp_is_refused_and_nothing_is_lost(stamp: int) -> None:
     mapper = Mapper(MapperConfig())

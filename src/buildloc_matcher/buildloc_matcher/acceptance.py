@@ -1,9 +1,10 @@
 """The gate between a ranked candidate and a fix: accepted, undecided or rejected, and which figure fell
 short.
 
-The score of the best candidate is the log-odds that the map lies there and neither at any of the other
-places that were found nor anywhere that chance could put it. How high it gets where the map lies nowhere
-near was measured (``calibration.json``); the threshold follows from the rate of false fixes asked for.
+The log-odds that the map lies at the best candidate, and neither at any of the other places that were found
+nor anywhere that chance could put it, are its score; those of a map with much evidence count for less, since
+by so much more two places that look alike differ by chance. How high the score gets where the map lies
+nowhere near was measured (``calibration.json``); the threshold follows from the rate of false fixes wanted.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from buildloc_matcher.refinement import Refined
 from buildloc_matcher.selection import Score
 
 ROTATIONS = 36
+FACE_VALUE_NATS = 50.0  # of evidence, up to which odds are taken as they are
 
 
 class Outcome(StrEnum):
@@ -69,6 +71,17 @@ def odds_against_all(best: Candidate, others: Sequence[Candidate], config: Match
     return best.acceptance - float(np.logaddexp.reduce([0.0, *_elsewhere(best, others, config)]))
 
 
+def score(best: Candidate, others: Sequence[Candidate], config: MatcherConfig) -> float:
+    """What the best candidate is worth, nats: its odds against everything else, per root of its evidence.
+
+    Of two places that look alike, neither of which is right, every building speaks for the one or the other
+    by chance. What the one leads by is a random walk: it grows with the root of the number of buildings, as
+    evidence grows with the number.
+    """
+    odds = odds_against_all(best, others, config)
+    return odds * math.sqrt(FACE_VALUE_NATS / max(best.acceptance, FACE_VALUE_NATS))
+
+
 def log_odds(evidence: float, area_m2: float, config: MatcherConfig) -> float:
     """Evidence of a candidate less the logarithm of the number of poses the reference has room for.
 
@@ -83,7 +96,7 @@ def judge_candidate(
     best: Candidate, others: Sequence[Candidate], found: Score, config: MatcherConfig
 ) -> Verdict:
     """Whether the best candidate is convincing. ``found`` is its score in the selection."""
-    nats, lead_nats = odds_against_all(best, others, config), lead(best, others, config)
+    nats, lead_nats = score(best, others, config), lead(best, others, config)
     chance, enough = false_fix_probability(nats), threshold(config.target_false_fix_rate)
 
     def not_yet(outcome: Outcome, reason: str) -> Verdict:

@@ -112,6 +112,12 @@ class MatcherConfig:
     follow_nats: float = param(
         7.0, "evidence that decides for or against a predicted place, nats; less decides nothing", 0.1, 1e3
     )
+    min_recent_lead: float = param(
+        0.15,
+        "smallest lead of a first fix over places near by, nats per building of the recent frames",
+        0.0,
+        1e3,
+    )
     max_jump_sigmas: float = param(
         5.0, "farthest that an agreement may lie from the prediction, standard deviations", 1.0, 100.0
     )

@@ -17,8 +17,8 @@ from buildloc_matcher.acceptance import (
     judge_candidate,
     lead,
     log_odds,
-    odds_against_all,
     refuse_refined,
+    score,
 )
 from buildloc_matcher.config import MatcherConfig, check_matcher
 from buildloc_matcher.evidence import QueryMap, query_map, seed_evidence
@@ -31,10 +31,10 @@ from buildloc_matcher.mesh import Mesh, mesh
 from buildloc_matcher.pursuit import Agreement, Place, Pose, sigmas_apart
 from buildloc_matcher.reference.buildings import OUTLINE_UNIT_M
 from buildloc_matcher.reference.database import DatabaseError, ReferenceDatabase, descriptor_hash
-from buildloc_matcher.refinement import Refined, Unrefined, covariance_enu, refine
-from buildloc_matcher.selection import Score, local_transform, select
+from buildloc_matcher.refinement import Refined, Unrefined, covariance_enu, refine, registration_covariance
+from buildloc_matcher.selection import Score, beyond_m, local_transform, select
 from buildloc_matcher.voting import Cluster, vote
-from buildloc_matcher.window import start_covariance
+from buildloc_matcher.window import start_covariance, start_sigma_m
 
 FEWEST_BUILDINGS = 4
 WARM_UP_BUILDINGS = 40
@@ -194,7 +194,7 @@ class Matcher:
         if candidates:
             funnel["lead"] = lead(candidates[0], candidates[1:], config)
             funnel["log_odds"] = candidates[0].acceptance
-            funnel["score"] = odds_against_all(candidates[0], candidates[1:], config)
+            funnel["score"] = score(candidates[0], candidates[1:], config)
         scores = tuple(score for _, score in selected)
         return MatchResult(candidates, scores, ballot.places_m, query, funnel, clock.seconds)
 
@@ -227,11 +227,20 @@ class Matcher:
         self, local_map: LocalMap, keyframes: Sequence[Keyframe], observations: Sequence[FrameObservation]
     ) -> Answer:
         """The position of the camera at the last keyframe, or why there is none."""
-        found = self.locate(local_map)
+        return self.conclude(self.locate(local_map), local_map.stamp_ns, keyframes, observations)
+
+    def conclude(
+        self,
+        found: MatchResult,
+        stamp_ns: int,
+        keyframes: Sequence[Keyframe],
+        observations: Sequence[FrameObservation],
+    ) -> Answer:
+        """What a search of the map of this stamp has found comes to: a fix, or the reason for none."""
         funnel = found.funnel | {f"{stage}_seconds": seconds for stage, seconds in found.seconds.items()}
 
         def none(reason: str) -> Answer:
-            return Answer(NoFix(local_map.stamp_ns, reason), found.candidates, funnel)
+            return Answer(NoFix(stamp_ns, reason), found.candidates, funnel)
 
         if not keyframes:
             return none("no keyframes yet")
@@ -239,8 +248,11 @@ class Matcher:
         if verdict.reason is not None:
             return none(verdict.reason)
         last = max(keyframes, key=lambda k: k.stamp_ns)
-        coarse = self.place(found, np.array([last.x_m, last.y_m]))
-        refined = refine(coarse, keyframes, observations, self.database.ground, self.config)
+        at_m, query = np.array([last.x_m, last.y_m]), found.query
+        assert query is not None
+        coarse = self.place(found, at_m)
+        start_m = start_sigma_m(self.config, beyond_m(found.scores[0], at_m, query))
+        refined = refine(coarse, keyframes, observations, self.database.ground, self.config, start_m)
         if isinstance(refined, Unrefined):
             return none(refined.reason)
         refused = refuse_refined(refined, self.config)
@@ -248,11 +260,18 @@ class Matcher:
             return none(refused)
         poses = _refined(refined)
         seen = seen_in_world(poses, observations, self.config.refine_frames)
-        offset = refined.position_m - coarse.apply(np.array([[last.x_m, last.y_m]]))[0]
-        opinion = ask(seen, offset, start_covariance(self.config), self.database.ground, self.config)
-        funnel |= {"recent_nats": opinion.nats, "recent_lead": opinion.lead}
+        offset, spread = (
+            refined.position_m - coarse.apply(at_m[None])[0],
+            start_covariance(start_m, self.config),
+        )
+        opinion = ask(seen, offset, spread, self.database.ground, self.config)
+        funnel |= {"recent_nats": opinion.nats, "recent_lead": opinion.lead, "recent_buildings": len(seen)}
         if opinion.outcome is not Outcome.ACCEPTED:
             return none(f"undecided: the latest frames do not agree: {opinion.reason}")
+        if opinion.lead < self.config.min_recent_lead * len(seen):
+            # Where houses stand close, many a place lays most of them near some house.
+            loose = f"lead {opinion.lead:.1f} nats over places near by, for {len(seen)} buildings"
+            return none(f"undecided: the latest frames fit loosely: {loose}")
         funnel |= {"refine_observed": refined.observed, "refine_pairs": refined.pairs}
         funnel |= {"refine_buildings": refined.buildings, "refine_rms_m": refined.rms_m}
         altitude = next((o.altitude_m for o in observations if o.stamp_ns == last.stamp_ns), float("nan"))
@@ -277,7 +296,7 @@ class Matcher:
         observations: Sequence[FrameObservation],
     ) -> Followed:
         """Whether the reference agrees that the last keyframe lies where ``predicted`` (map -> world) puts
-        it, up to a covariance (3, 3) over east, north and yaw."""
+        it, up to a covariance (3, 3) over east, north and yaw, the reference's registration included."""
         config, reference = self.config, self.database.ground
         last = max(keyframes, key=lambda k: k.stamp_ns)
         refined = refine(predicted, keyframes, observations, reference, config)
@@ -291,7 +310,7 @@ class Matcher:
         refused = refined.reason if isinstance(refined, Unrefined) else refuse_refined(refined, config)
         if isinstance(refined, Unrefined) or refused is not None:
             return Followed(replace(opinion, outcome=Outcome.UNDECIDED, reason=refused or ""), None)
-        apart = sigmas_apart(offset, covariance + refined.covariance)
+        apart = sigmas_apart(offset, covariance, refined.covariance, registration_covariance(config))
         if apart > config.max_jump_sigmas:
             jump = f"the place jumped by {math.hypot(*offset[:2]):.1f} m, {apart:.1f} standard deviations"
             return Followed(replace(opinion, outcome=Outcome.REJECTED, reason=jump), None)

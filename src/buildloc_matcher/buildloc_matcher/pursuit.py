@@ -181,6 +181,7 @@ def prediction(anchor: Anchor, keyframe: Keyframe) -> Similarity:
     return Similarity((keyframe.x_m, keyframe.y_m), (anchor.x_m, anchor.y_m), turn, scale)
 
 
-def sigmas_apart(offset: FloatArray, covariance: FloatArray) -> float:
-    """Mahalanobis length of an offset (3,) east, north, yaw."""
-    return math.sqrt(float(offset @ np.linalg.solve(covariance, offset)))
+def sigmas_apart(offset: FloatArray, one: FloatArray, other: FloatArray, shared: FloatArray) -> float:
+    """Mahalanobis length of an offset (3,) east, north, yaw between two places with covariances (3, 3), of
+    which ``shared`` is an error that both have and their difference has not."""
+    return math.sqrt(float(offset @ np.linalg.solve(one + other - 2.0 * shared, offset)))

@@ -34,11 +34,11 @@ from buildloc_matcher.window import (
     start_sigma_m,
 )
 
-RIVAL_M = 20.0  # another optimum is sought within this distance
+RIVAL_M, MOST_RIVAL_M = 25.0, 60.0  # another optimum is sought within three sigma of the start, but these
 RIVAL_CELL_M = 3.0
 RIVAL_TURN_RAD = math.radians(4.0)
-RIVALS = 4  # shifts tried
-KEPT = (8, 4, 4)  # the best after each rigid step
+RIVALS = 8  # shifts tried
+KEPT = (10, 5, 5)  # the best after each rigid step
 SOME = 80  # observations: enough to tell one place from another
 SAME_M = 2.0  # optima nearer than this, or than three sigma, are one
 ONE_BUILDING_M = 3.0
@@ -77,6 +77,7 @@ def refine(
     observations: Sequence[FrameObservation],
     reference: Ground,
     config: MatcherConfig,
+    start_m: float | None = None,
 ) -> Refined | Unrefined:
     """Correct where ``coarse`` (map -> world) puts the last ``refine_frames`` keyframes.
 
@@ -87,12 +88,14 @@ def refine(
     well.
     """
     last = sorted(keyframes, key=lambda k: k.stamp_ns)[-config.refine_frames :]
-    window = make_window(last, observations) if last else None
+    sigma_m = start_sigma_m(config) if start_m is None else start_m
+    window = make_window(last, observations, sigma_m) if last else None
     if window is None or not len(window.level_m):
         return NO_BUILDINGS
     state = start(coarse, last)
     points = placed(window, state)
-    reach = 2.0 * config.refine_distance_m
+    reach_m = min(max(RIVAL_M, 3.0 * sigma_m), MOST_RIVAL_M)
+    reach = reach_m + config.refine_distance_m
     rows = within(reference.grid, *(points.min(axis=0) - reach), *(points.max(axis=0) + reach))
     if len(rows) < 3:
         return NO_BUILDINGS
@@ -102,7 +105,7 @@ def refine(
         config.refine_distance_m, config.refine_last_distance_m, config.refine_iterations
     ):
         moved = _moved_as_one(window, moved, associate(window, moved, tree, distance_m))
-    starts = [moved, state, *(moved.moved(by) for by in _elsewhere(placed(window, moved), tree))]
+    starts = [moved, state, *(moved.moved(by) for by in _elsewhere(placed(window, moved), tree, reach_m))]
     for pairing in _pairings(window, reference, rows, tree, config):
         optima = _Optima(window, state, starts, pairing, config)
         solution = solve(window, optima.best, pairing, config)
@@ -113,8 +116,7 @@ def refine(
     rival_m = optima.rival_m(solution)
     if rival_m is not None:
         return Unrefined(f"refinement found two optima {rival_m:.1f} m apart that fit alike")
-    registration = np.diag([*2 * [config.sigma_registration_m**2], 0.0])
-    covariance = config.sigma_inflation**2 * solution.covariance + registration
+    covariance = config.sigma_inflation**2 * solution.covariance + registration_covariance(config)
     position, yaw = solution.state.poses[-1, :2], float(wrap(solution.state.poses[-1, 2]))
     return Refined(
         position, yaw, covariance, dict(zip(window.stamps_ns, solution.state.poses, strict=True)),
@@ -171,7 +173,7 @@ class _Optima:
         told = np.einsum("pi,pij,pj->p", apart, pairs.certainty, apart)
         costs = np.full(len(self._weights), alone)
         costs[pairs.rows] += pairs.covered * np.minimum(0.0, cauchy(told / sigma_m**2) - alone)
-        away = (state.poses - self._coarse.poses)[-1, :2] / start_sigma_m(self._config)
+        away = (state.poses - self._coarse.poses)[-1, :2] / self._window.start_m
         return float(self._weights @ costs + 0.5 * away @ away)
 
     def rival_m(self, solution: Solution) -> float | None:
@@ -186,16 +188,23 @@ class _Optima:
         return None
 
 
-def _elsewhere(points_m: FloatArray, tree: cKDTree) -> list[Similarity]:
-    """Motions that put many buildings of the reference onto others, and turns: candidates for an optimum."""
-    centre = (float(points_m[:, 0].mean()), float(points_m[:, 1].mean()))
-    pairs = tree.query_pairs(RIVAL_M, output_type="ndarray")
-    shifts = tree.data[pairs[:, 1]] - tree.data[pairs[:, 0]]
-    shifts = np.concatenate([shifts, -shifts])
-    cells, counts = np.unique(np.round(shifts / RIVAL_CELL_M), axis=0, return_counts=True)
-    often = cells[np.argsort(-counts, kind="stable")[:RIVALS]] * RIVAL_CELL_M
-    moves = [Similarity(centre, (centre[0] + x, centre[1] + y), 0.0) for x, y in often.tolist()]
-    return moves + [Similarity(centre, centre, turn) for turn in (-RIVAL_TURN_RAD, RIVAL_TURN_RAD)]
+def _elsewhere(points_m: FloatArray, tree: cKDTree, reach_m: float) -> list[Similarity]:
+    """Motions that lay many of the observed buildings (N, 2) onto some of the reference, as they are and
+    turned either way, the most first: candidates for an optimum."""
+    centre = points_m.mean(axis=0)
+    anchor = (float(centre[0]), float(centre[1]))
+    moves, counts = list[Similarity](), list[int]()
+    for turn in (0.0, -RIVAL_TURN_RAD, RIVAL_TURN_RAD):
+        turned = Similarity(anchor, anchor, turn).apply(points_m)
+        near = tree.query_ball_point(turned, reach_m)
+        which = np.repeat(np.arange(len(turned)), [len(one) for one in near])
+        shifts = tree.data[np.concatenate(near).astype(np.int64)] - turned[which]
+        cells, often = np.unique(np.round(shifts / RIVAL_CELL_M), axis=0, return_counts=True)
+        for at in np.argsort(-often, kind="stable")[:RIVALS]:
+            x, y = (centre + cells[at] * RIVAL_CELL_M).tolist()
+            moves.append(Similarity(anchor, (x, y), turn))
+            counts.append(int(often[at]))
+    return [moves[at] for at in np.argsort(-np.array(counts), kind="stable")[:RIVALS]]
 
 
 def horizontal_variance(
@@ -212,6 +221,11 @@ def horizontal_variance(
     residual = max(rms_m**2, 2.0 * config.sigma_building_m**2)
     variance = residual / math.sqrt(len(matched_m)) * (1.0 + lever / max(spread, 1.0))
     return variance + config.sigma_registration_m**2
+
+
+def registration_covariance(config: MatcherConfig) -> FloatArray:
+    """(3, 3) over east, north and yaw of what all places found in the reference share."""
+    return np.diag([*2 * [config.sigma_registration_m**2], 0.0])
 
 
 def covariance_enu(pose_covariance: FloatArray, config: MatcherConfig) -> FloatArray:

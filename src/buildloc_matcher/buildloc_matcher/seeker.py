@@ -31,6 +31,7 @@ from buildloc_matcher.pursuit import (
     sigmas_apart,
     withdraw,
 )
+from buildloc_matcher.refinement import registration_covariance
 
 WAITING = "waiting for a map"
 UNTRACKED = "no frame is tracked in a keyframe that has a place"
@@ -166,7 +167,9 @@ class Seeker:
         assert isinstance(fix, Fix)
         offset = np.array([fix.easting_m - anchor.x_m, fix.northing_m - anchor.y_m, 0.0])
         offset[2] = wrap(fix.yaw_rad - anchor.yaw_rad)
-        apart = sigmas_apart(offset, anchor.uncertainty(config) + found.agreement.covariance)
+        apart = sigmas_apart(
+            offset, anchor.uncertainty(config), found.agreement.covariance, registration_covariance(config)
+        )
         if apart <= config.max_jump_sigmas:
             return None
         away = math.hypot(*offset[:2])

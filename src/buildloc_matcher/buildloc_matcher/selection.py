@@ -29,9 +29,9 @@ from buildloc_matcher.voting import Ballot, Cluster
 
 GROWN_SCORED = 10  # distinct grown matches that get the full score
 NEGLIGIBLE_NATS = 60.0  # a match that much less likely than the best is not listed
+LOCAL_M = 100.0  # pairs around a place that tell how the map lies there, and how many it takes
+LOCAL_PAIRS = 6
 SHIFT_M = 100.0  # how far a match is moved to see whether it fits as well there
-LOCAL_M = 100.0
-FAR_WEIGHT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -58,10 +58,16 @@ def local_transform(
     if config.selection == "rigid" or len(score.pairs) < 3:
         return score.transform
     source, target = query.points_m[score.pairs[:, 0]], reference.buildings_m[score.pairs[:, 1]]
-    squared = np.sum((source - at_m) ** 2, axis=1)
-    # Far pairs keep a little weight, so that a lonely end of the map is still turned by the rest.
-    weights = np.exp(-0.5 * squared / LOCAL_M**2) + FAR_WEIGHT
-    return fit_similarity(source, target, config.scale_gate, weights)
+    away = np.hypot(*(source - at_m).T)
+    # Wide enough for some pairs, so that a lonely end of the map goes on as it came.
+    reach = max(LOCAL_M, beyond_m(score, at_m, query))
+    return fit_similarity(source, target, config.scale_gate, np.exp(-0.5 * (away / reach) ** 2))
+
+
+def beyond_m(score: Score, at_m: FloatArray, query: QueryMap) -> float:
+    """How far from a point (2,) of the map the LOCAL_PAIRS nearest matched buildings reach; 0 without any."""
+    away = np.sort(np.hypot(*(query.points_m[score.pairs[:, 0]] - at_m).T))
+    return float(away[min(LOCAL_PAIRS, len(away)) - 1]) if len(away) else 0.0
 
 
 def mutual_pairs(query_m: FloatArray, reference_m: FloatArray, max_distance_m: float) -> NDArray[np.int64]:

@@ -34,7 +34,8 @@ class Window:
 
     ``steps`` (K-1, 3) is the mapper's pose of each keyframe in the axes of the one before; ``frames`` (N,)
     the keyframe of an observation, rising, and ``level_m`` (N, 2) its place in the level camera frame;
-    ``outlines_m`` (N, P, 2) points of its outline there, or None.
+    ``outlines_m`` (N, P, 2) points of its outline there, or None. ``start_m``: the standard deviation per
+    axis of where the last keyframe is thought to be.
     """
 
     stamps_ns: tuple[int, ...]
@@ -42,6 +43,7 @@ class Window:
     frames: NDArray[np.int64]
     level_m: FloatArray
     outlines_m: FloatArray | None
+    start_m: float
 
     def thinned(self, rows: NDArray[np.int64]) -> Window:
         """All keyframes with some of the observations, and half of the points of their outlines."""
@@ -92,7 +94,9 @@ class Solution:
     growth: float
 
 
-def make_window(keyframes: Sequence[Keyframe], observations: Sequence[FrameObservation]) -> Window:
+def make_window(
+    keyframes: Sequence[Keyframe], observations: Sequence[FrameObservation], start_m: float
+) -> Window:
     """The window of keyframes, sorted by time and at least one; observations of other frames are left out."""
     of_frame = {o.stamp_ns: o for o in observations if len(o.centroids_m)}
     found = [of_frame.get(k.stamp_ns) for k in keyframes]
@@ -104,7 +108,8 @@ def make_window(keyframes: Sequence[Keyframe], observations: Sequence[FrameObser
     steps = np.column_stack([_turned(moves[:, :2], -poses[:-1, 2]), moves[:, 2]])
     frames = np.repeat(np.arange(len(keyframes)), [len(one) for one in seen])
     around = np.concatenate(known) if known and len(known) == len(outlines) else None
-    return Window(tuple(k.stamp_ns for k in keyframes), steps, frames, np.concatenate(seen), around)
+    stamps = tuple(k.stamp_ns for k in keyframes)
+    return Window(stamps, steps, frames, np.concatenate(seen), around, start_m)
 
 
 def start(coarse: Similarity, keyframes: Sequence[Keyframe]) -> State:
@@ -114,15 +119,16 @@ def start(coarse: Similarity, keyframes: Sequence[Keyframe]) -> State:
     return State(placed, np.array([0.0, math.log(coarse.scale)]))
 
 
-def start_sigma_m(config: MatcherConfig) -> float:
-    """Error of the start, per axis: its buildings are sought within three of them."""
-    return config.refine_distance_m / 3.0
+def start_sigma_m(config: MatcherConfig, beyond_m: float = 0.0) -> float:
+    """Error of a start that far from what it goes by, per axis: its buildings are sought within three of
+    them. A heading that walks at random leads aside with the power 3/2 of the distance."""
+    strayed = math.radians(config.walk_deg) ** 2 * beyond_m**3 / 3.0
+    return math.sqrt((config.refine_distance_m / 3.0) ** 2 + strayed)
 
 
-def start_covariance(config: MatcherConfig) -> FloatArray:
+def start_covariance(start_m: float, config: MatcherConfig) -> FloatArray:
     """(3, 3) of the start's last pose over east, north and yaw."""
-    turn = math.radians(config.rotation_tolerance_deg)
-    return np.diag(np.square([start_sigma_m(config), start_sigma_m(config), turn]))
+    return np.diag(np.square([start_m, start_m, math.radians(config.rotation_tolerance_deg)]))
 
 
 def placed(window: Window, state: State) -> FloatArray:
@@ -197,7 +203,7 @@ class _Fit:
     def __init__(
         self, window: Window, state: State, first: State, pairs: Pairs, growth: float, config: MatcherConfig
     ) -> None:
-        self._state, self._first, self._config = state, first, config
+        self._state, self._first, self._config, self._start_m = state, first, config, window.start_m
         frames = window.frames[pairs.rows]
         turned = _turned(window.level_m[pairs.rows], state.poses[frames, 2])
         self._arms = math.exp(state.log_scales[0]) * turned
@@ -267,8 +273,8 @@ class _Fit:
     def _prior(self) -> FloatArray:
         """(3 K + 2,) information of the start, which is weak, about the last pose, and of both scales."""
         information = np.zeros(3 * len(self._of_frame) + 2)
-        place, turn = start_sigma_m(self._config), math.radians(self._config.rotation_tolerance_deg)
-        information[-5:] = 1.0 / np.square([place, place, turn, *2 * [self._config.sigma_scale]])
+        turn, scale = math.radians(self._config.rotation_tolerance_deg), self._config.sigma_scale
+        information[-5:] = 1.0 / np.square([self._start_m, self._start_m, turn, scale, scale])
         return information
 
     def information(self, weights: FloatArray) -> FloatArray:

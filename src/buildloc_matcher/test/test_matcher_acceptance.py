@@ -15,6 +15,7 @@ from buildloc_matcher.acceptance import (
     log_odds,
     odds_against_all,
     refuse_refined,
+    score,
 )
 from buildloc_matcher.calibration import Tail, measured, threshold
 from buildloc_matcher.config import MatcherConfig
@@ -62,6 +63,16 @@ def test_the_score_is_the_odds_against_everything_else() -> None:
     assert odds_against_all(best, [rival, rival], CONFIG) == pytest.approx(-math.log(2.0))  # two like it
     beside = candidate(10.0, 0.0, 50.0)  # the same answer
     assert odds_against_all(best, [beside], CONFIG) == pytest.approx(50.0)
+
+
+def test_odds_count_by_the_root_of_the_evidence() -> None:
+    """Four times the buildings lead another place that looks alike by twice as much, by chance."""
+    best, rival = candidate(0.0, 0.0, 50.0), candidate(100.0, 0.0, 30.0)
+    assert score(best, [rival], CONFIG) == odds_against_all(best, [rival], CONFIG)
+    best, rival = candidate(0.0, 0.0, 200.0), candidate(100.0, 0.0, 160.0)
+    assert score(best, [rival], CONFIG) == pytest.approx(20.0)
+    assert score(best, [], CONFIG) == pytest.approx(100.0)
+    assert score(candidate(0.0, 0.0, -3.0), [], CONFIG) < 0.0
 
 
 def test_three_outcomes() -> None:

@@ -11,6 +11,7 @@ from buildloc_matcher.acceptance import Outcome
 from buildloc_matcher.follow import ask, seen_in_world
 from buildloc_matcher.geometry import Similarity, rotation, wrap
 from buildloc_matcher.matcher import Followed, Matcher
+from buildloc_matcher.refinement import registration_covariance
 from buildloc_msgs_py.types import FloatArray, FrameObservation, Keyframe
 from towns import DEFAULT, ORIGIN_M, Buildings, alike, lattice, town, whole
 
@@ -75,9 +76,18 @@ def test_buildings_that_the_reference_does_not_have_disagree() -> None:
 
 def test_a_correction_beyond_the_uncertainty_is_a_jump() -> None:
     strict = Matcher(MATCHER.database, replace(DEFAULT, max_jump_sigmas=2.0))
-    followed = strict.follow(predicted(9.0, 0.0), np.diag([0.01, 0.01, 1e-6]), KEYFRAMES, frames(TOWN))
+    spread = np.diag([0.01, 0.01, 1e-6]) + registration_covariance(DEFAULT)
+    followed = strict.follow(predicted(9.0, 0.0), spread, KEYFRAMES, frames(TOWN))
     assert followed.opinion.outcome is Outcome.REJECTED and followed.agreement is None
     assert "the place jumped by" in followed.opinion.reason
+
+
+def test_the_registration_of_the_reference_excuses_no_jump() -> None:
+    """It moves prediction and correction alike: with 1.5 m of it counted twice, 9 m would be 4.2 sigma."""
+    spread = np.diag([0.04, 0.04, 1e-6]) + registration_covariance(DEFAULT)
+    assert follow(TOWN, 1.0, 0.0, spread).opinion.outcome is Outcome.ACCEPTED
+    followed = follow(TOWN, 9.0, 0.0, spread)
+    assert followed.opinion.outcome is Outcome.REJECTED and "jumped by 9" in followed.opinion.reason
 
 
 def test_a_street_grid_that_fits_next_door_decides_nothing_once_the_next_door_is_possible() -> None:

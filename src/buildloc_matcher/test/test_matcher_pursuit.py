@@ -175,5 +175,9 @@ def test_withdrawn_is_withdrawn() -> None:
 
 
 def test_offsets_are_told_in_standard_deviations() -> None:
-    assert sigmas_apart(np.array([6.0, 0.0, 0.0]), SPREAD) == pytest.approx(3.0)
-    assert sigmas_apart(np.array([0.0, 0.0, math.radians(5.0)]), SPREAD) == pytest.approx(5.0)
+    none = np.zeros((3, 3))
+    assert sigmas_apart(np.array([6.0, 0.0, 0.0]), SPREAD, none, none) == pytest.approx(3.0)
+    assert sigmas_apart(np.array([0.0, 0.0, math.radians(5.0)]), SPREAD, none, none) == pytest.approx(5.0)
+    # What both places share is no difference between them: 6 m of 2 (4 - 3) m2 and not of 2 * 4.
+    shared = np.diag([3.0, 3.0, 0.0])
+    assert sigmas_apart(np.array([6.0, 0.0, 0.0]), SPREAD, SPREAD, shared) == pytest.approx(math.sqrt(18.0))

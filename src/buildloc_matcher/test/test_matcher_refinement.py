@@ -81,10 +81,10 @@ def test_only_the_last_frames_with_a_pose_count() -> None:
 
 
 def test_frames_lie_in_the_world_where_the_coarse_pose_puts_them() -> None:
-    points = placed(make_window(POSES, frames_of(POSES, 0.0)), start(coarse(0.0, 0.0, 0.0), POSES))
+    points = placed(make_window(POSES, frames_of(POSES, 0.0), 5.0), start(coarse(0.0, 0.0, 0.0), POSES))
     apart = np.hypot(*(points[:, None] - CITY[None]).transpose(2, 0, 1)).min(axis=1)
     assert len(points) > 500 and apart.max() < 1e-9
-    assert len(make_window(POSES, []).level_m) == 0
+    assert len(make_window(POSES, [], 5.0).level_m) == 0
 
 
 def test_invented_and_missing_buildings_pull_little() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ class Scripted:
     ``outcomes`` in turn, always agreeing with the prediction up to ``offset_m``."""
 
     def __init__(self, **parameters: float) -> None:
-        self.config = MatcherConfig(**parameters)
+        self.config = MatcherConfig(sigma_registration_m=0.5, **parameters)
         self.places: deque[tuple[float, float] | None] = deque()
         self.outcomes: deque[Outcome] = deque()
         self.searches = 0
@@ -128,7 +129,7 @@ def test_disagreement_withdraws_and_the_search_begins_again(matcher: Scripted, s
 
 
 def test_now_and_then_the_global_search_has_to_confirm(matcher: Scripted) -> None:
-    matcher.config = MatcherConfig(check_keyframes=2)
+    matcher.config = replace(matcher.config, check_keyframes=2)
     seeker = Seeker(matcher)  # type: ignore[arg-type]
     # Confirmed at keyframe 3, not found at 5, which says nothing, and elsewhere at 7.
     matcher.places += [(500.0, 700.0), (561.0, 700.0), None, (900.0, 700.0)]

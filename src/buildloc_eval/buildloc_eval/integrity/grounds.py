@@ -27,6 +27,7 @@ from buildloc_eval.integrity.plan import (
     MISSING,
     SCATTERED,
     TOWNS,
+    TOWNS_ALIKE,
     VARIANTS,
     Place,
     Plan,
@@ -36,7 +37,8 @@ from buildloc_eval.observed_flight import Flown, everywhere
 from buildloc_eval.realworld import data_folder
 
 APART_KM = 1.0  # flights outside of a reference are that far from it
-TOWN_M, TOWN_START_M, TOWN_GAP_M = 1600.0, 150.0, 30.0
+TOWN_M, TOWN_START_M, TOWN_PITCH_M = 1600.0, 150.0, 2400.0  # no two of any heading touch
+CROSSING_M = 16.0  # of a street that crosses
 Say = Callable[[str], None]
 T = TypeVar("T")
 
@@ -63,53 +65,75 @@ def centre_m(place: Place, epsg: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class GridDesign:
-    """A suburb of equal lots: houses every ``lot_m`` in rows, two to a street, which are ``street_m`` apart;
-    the shares of lots with another plan than the common one and of vacant lots; the houses' scatter, m."""
+    """A suburb of equal lots: houses every ``lot_m`` in rows, two to a street, which are ``street_m`` apart.
+
+    The far row begins ``stagger`` of a lot later; after every ``block`` lots a street crosses, with larger
+    houses at the corners or not. ``plans`` (P, 3) are width, depth and side of the garage, m; houses stand
+    ``aside_m`` off the middle of the lot, on the other side where ``mirrored``. Shares of lots with another
+    plan than the first, mirrored, and vacant; the houses' scatter, m.
+    """
 
     lot_m: float
     street_m: float
+    stagger: float
+    block: int
+    corners: bool
+    plans: tuple[tuple[float, float, float], ...]
+    aside_m: float
     other_plans: float
+    mirrored: float
     vacant: float
     scatter_m: float
 
 
+CORNER_HOUSE = 1.25  # how much wider and deeper than the first plan
+
+
 def grid_design(rng: np.random.Generator) -> GridDesign:
-    """Any suburb."""
-    return GridDesign(
-        rng.uniform(17.0, 26.0), rng.uniform(52.0, 68.0), rng.uniform(0.0, 0.3), rng.uniform(0.01, 0.05), 0.3
+    """Any suburb: from one plan on every lot to lots that have little in common but their size."""
+    lot = rng.uniform(15.0, 30.0)
+    width, depth = rng.uniform(0.55, 0.75) * lot, rng.uniform(8.0, 13.0)
+    plans = tuple(
+        (width * rng.uniform(0.85, 1.15), depth * rng.uniform(0.85, 1.15), float(rng.choice((0.0, 3.0, 5.0))))
+        for _ in range(int(rng.integers(2, 5)))
     )
+    return GridDesign(
+        lot, rng.uniform(48.0, 72.0), float(rng.choice((0.0, 0.5, rng.random()))), int(rng.integers(6, 21)),
+        bool(rng.integers(2)), plans, rng.uniform(0.0, 2.0), rng.uniform(0.0, 0.5),
+        float(rng.choice((0.0, 0.5))), rng.uniform(0.0, 0.06), rng.uniform(0.1, 0.8),
+    )  # fmt: skip
 
 
-PLANS_M = ((14.0, 9.0, 0.0), (13.0, 10.0, 0.0), (14.0, 9.0, 4.0))  # width, depth, a garage's side
-
-
-def _house_plans() -> tuple[FloatArray, FloatArray]:
-    """Areas (3,) and shapes (3, 4) of the plans."""
+def _house_plans(design: GridDesign) -> tuple[FloatArray, FloatArray]:
+    """Areas (P + 1,) and shapes (P + 1, 4) of the plans, the corner house last."""
+    wide, deep, garage = design.plans[0]
     outlines = [
         shapely.union(shapely.box(0.0, 0.0, wide, deep), shapely.box(0.0, deep - 0.5, side, deep + side))
-        for wide, deep, side in PLANS_M
+        for wide, deep, side in (*design.plans, (CORNER_HOUSE * wide, CORNER_HOUSE * deep, garage))
     ]
     found = footprints(np.array(outlines, dtype=object))
     return found.areas_m2, found.shapes
 
 
 def grid_town(design: GridDesign, at_m: FloatArray, rng: np.random.Generator) -> Buildings:
-    """One building of the design, at any heading; two of them differ in vacant lots and plans alone."""
+    """A suburb of the design, at any heading; two of them differ in vacant lots, plans and scatter alone."""
     half = TOWN_M / 2.0
-    u, street = np.meshgrid(
-        np.arange(-half, half, design.lot_m), np.arange(-half, half, design.street_m), indexing="ij"
-    )
-    back = 0.24 * design.street_m
-    points = np.concatenate(
-        [np.column_stack([u.ravel(), (street + side * back).ravel()]) for side in (-1, 1)]
-    )
-    points = points[rng.random(len(points)) >= design.vacant]
+    lots, rows = int(TOWN_M / design.lot_m), int(TOWN_M / design.street_m)
+    lot, row, side = (one.ravel() for one in np.meshgrid(range(lots), range(rows), (-1, 1), indexing="ij"))
+    crossed = lot // design.block
+    u = (lot + design.stagger * (side > 0)) * design.lot_m + crossed * CROSSING_M - half
+    points = np.column_stack([u, row * design.street_m + side * 0.24 * design.street_m - half])
+    corner = design.corners & ((lot % design.block == 0) | (lot % design.block == design.block - 1))
+    built = (rng.random(len(points)) >= design.vacant) & (u < half)
+    points, corner = points[built], corner[built]
+    points[:, 0] += design.aside_m * np.where(rng.random(len(points)) < design.mirrored, -1.0, 1.0)
     points += rng.normal(0.0, design.scatter_m, points.shape)
     angle = rng.uniform(-math.pi, math.pi)
     c, s = math.cos(angle), math.sin(angle)
-    areas, shapes = _house_plans()
-    other = rng.integers(1, len(areas), len(points))
+    areas, shapes = _house_plans(design)
+    other = rng.integers(1, len(design.plans), len(points))
     plan = np.where(rng.random(len(points)) < design.other_plans, other, 0)
+    plan[corner] = len(design.plans)
     placed = at_m + points @ np.array([[c, s], [-s, c]])
     return Buildings(placed, areas[plan].astype(np.float32), shapes[plan].astype(np.float32))
 
@@ -173,24 +197,19 @@ class Grounds:
             away = length[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
             return Buildings(own.centroids_m + away, own.areas_m2, own.shapes)
         if variant == GRID:
-            for town in range(TOWNS):
-                site = self.town_site_m(place, town)
-                offset = np.abs(own.centroids_m - site).max(axis=1)
-                own = concatenate(
-                    [own.select(offset > TOWN_M / math.sqrt(2.0) + TOWN_GAP_M), self.town(place, town)]
-                )
+            return concatenate([own, *(self.town(place, town) for town in range(TOWNS))])
         return own
 
     def town_site_m(self, place: Place, town: int) -> FloatArray:
-        """(2,) where a suburb lies: on a ring about the centre, those in no reference as well."""
-        reach = 0.55 * 1000.0 * place.radii_km[-1]
-        angle = 2.0 * math.pi * (town % TOWNS + 0.3) / TOWNS
-        centre = centre_m(place, self.source(place.reference).epsg)
-        return np.asarray(centre + reach * np.array([math.cos(angle), math.sin(angle)]))
+        """(2,) where a suburb lies: in a block to the east of the city, those in no reference as well."""
+        column, row = divmod(town % TOWNS, TOWNS_ALIKE)
+        first = 1000.0 * place.radii_km[-1] + TOWN_PITCH_M
+        east, north = first + column * TOWN_PITCH_M, (row - 0.5 * (TOWNS_ALIKE - 1)) * TOWN_PITCH_M
+        return np.array([east, north]) + centre_m(place, self.source(place.reference).epsg)
 
     def town(self, place: Place, town: int) -> Buildings:
-        """A suburb of the place's design; the first TOWNS are those of its reference."""
-        design = grid_design(self._rng(place, len(VARIANTS)))
+        """A suburb; the first TOWNS are those of the reference, TOWNS_ALIKE of one design each."""
+        design = grid_design(self._rng(place, len(VARIANTS), town % TOWNS // TOWNS_ALIKE))
         return grid_town(design, self.town_site_m(place, town), self._rng(place, len(VARIANTS) + 1, town))
 
     def source(self, name: str) -> Source:

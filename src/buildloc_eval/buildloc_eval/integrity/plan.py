@@ -27,7 +27,8 @@ FAR_SHIFT_M = (5.0, 20.0)
 SNOW = (0.30, 0.60)
 WRONG_SCALE = 0.10
 TOWN_NONE = -1
-TOWNS = 4  # grid suburbs set into a city; as many again are flown over and in no reference
+TOWNS_ALIKE = 4  # grid suburbs of one design
+TOWNS = 8 * TOWNS_ALIKE  # set beside a city; as many again are flown over and in no reference
 
 AS_IS, SCATTERED, GRID = "as is", "scattered", "grid"
 

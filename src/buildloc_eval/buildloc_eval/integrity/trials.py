@@ -12,7 +12,7 @@ from buildloc_matcher.acceptance import Verdict
 from buildloc_matcher.config import MatcherConfig, matcher_config
 from buildloc_matcher.matcher import Matcher, MatchResult
 from buildloc_matcher.reference.database import ReferenceDatabase
-from buildloc_msgs_py.types import Fix, FloatArray, LocalMap, NoFix
+from buildloc_msgs_py.types import Fix, FloatArray, NoFix
 
 from buildloc_eval.integrity.grounds import Grounds
 from buildloc_eval.integrity.plan import TOWN_NONE, Place, Plan, Trial, shift_of, streams, trial
@@ -41,17 +41,6 @@ class Attempt:
         """The same of a place of the map."""
         mapped = self.flight.local_map.centroids_m
         return true_place(mapped, self.flight.true_m, at_m) + self.shift_m
-
-
-class RecordingMatcher(Matcher):
-    """A matcher that keeps what its last search found: a fix tells less."""
-
-    found: MatchResult
-
-    def locate(self, local_map: LocalMap) -> MatchResult:
-        """As the matcher's."""
-        self.found = super().locate(local_map)
-        return self.found
 
 
 def other_city(plan: Plan, place: Place) -> Place:
@@ -101,17 +90,18 @@ def run(number: int, grounds: Grounds) -> Record:
     started = time.perf_counter()
     tried = attempt(one, grounds)
     flown, worked = time.perf_counter(), time.process_time()
-    matcher = RecordingMatcher(tried.database, config_of(one))
-    answer = matcher.fix(tried.flight.local_map, tried.flight.keyframes, tried.flight.observations)
+    matcher, flight = Matcher(tried.database, config_of(one)), tried.flight
+    found = matcher.locate(flight.local_map)
+    answer = matcher.conclude(found, flight.local_map.stamp_ns, flight.keyframes, flight.observations)
     answered = time.perf_counter()
     record = _told(one, tried)
     record |= {"observe_s": flown - started, "seconds": answered - flown}
     record["cpu_s"] = time.process_time() - worked
-    record |= _judged(matcher.judge(matcher.found), answer.result)
-    errors = _errors(one, matcher.found, tried)
-    record |= _candidates(matcher.found)
+    record |= _judged(matcher.judge(found), answer.result)
+    errors = _errors(one, found, tried)
+    record |= _candidates(found)
     record |= {"candidate_error_m": errors, "best_error_m": errors[0] if errors else math.nan}
-    record["search_camera_error_m"] = _camera_error(one, matcher, matcher.found, tried)
+    record["search_camera_error_m"] = _camera_error(one, matcher, found, tried)
     record |= {f"funnel.{name}": value for name, value in answer.funnel.items()}
     record |= _fix(one, answer.result, tried)
     if one.paper:

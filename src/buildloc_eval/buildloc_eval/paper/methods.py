@@ -14,7 +14,7 @@ from buildloc_matcher.reference.database import ReferenceDatabase, assemble
 from buildloc_matcher.refinement import Refined, refine
 from buildloc_matcher.session import frames_kept
 from buildloc_msgs_py.errors import BuildlocError
-from buildloc_msgs_py.types import FloatArray
+from buildloc_msgs_py.types import FloatArray, NoFix
 from numpy.typing import NDArray
 
 from buildloc_eval.generators import method
@@ -90,7 +90,8 @@ def ranked_bins(found: MatchResult, bin_m: float) -> NDArray[np.int32]:
 
 
 def locate(matcher: Matcher, maps: Maps, keyframes: int, final: bool) -> Prediction:
-    """The ranking after so many keyframes, with the refined place of the last one if ``final``."""
+    """The ranking after so many keyframes and whether it is a fix, with the refined place of the last one if
+    ``final``."""
     snapshot = maps.snapshots[keyframes - 1]
     if snapshot is None:
         return nothing("no keyframe is mapped yet")
@@ -99,7 +100,12 @@ def locate(matcher: Matcher, maps: Maps, keyframes: int, final: bool) -> Predict
     except BuildlocError as error:
         return nothing(str(error))
     ranked = ranking(matcher, found)
-    if not (final and found.candidates):
+    if not found.candidates:
+        return ranked
+    seen = maps.observations[:keyframes][-frames_kept(matcher.config) :]
+    answer = matcher.conclude(found, snapshot.local_map.stamp_ns, snapshot.keyframes, seen).result
+    ranked = replace(ranked, refused=answer.reason if isinstance(answer, NoFix) else None)
+    if not final:
         return ranked
     started = time.perf_counter()
     refined = _refined(matcher, found, maps, snapshot, keyframes)

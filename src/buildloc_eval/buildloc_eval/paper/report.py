@@ -195,6 +195,7 @@ class Converged:
     stable: int | None
     ranks: tuple[int, ...]
     stable_rank: int | None
+    accepted: int | None = None  # the first prefix that is a fix, right or wrong
 
 
 def converged(stores: Stores, flights: Sequence[Flight], plan: Plan, seed: int) -> list[Converged]:
@@ -210,7 +211,8 @@ def converged(stores: Stores, flights: Sequence[Flight], plan: Plan, seed: int) 
                     first, stable = first_and_stable([one.rank == 1 for one in scores])
                     ranks = tuple(one.bin_rank for one in scores)
                     _, top = first_and_stable([rank == 1 for rank in ranks])
-                    found.append(Converged(name, radius, s, flight.name, first, stable, ranks, top))
+                    accepted, _ = first_and_stable([one.fix for one in scores])
+                    found.append(Converged(name, radius, s, flight.name, first, stable, ranks, top, accepted))
     return found
 
 
@@ -236,6 +238,9 @@ def convergence_table(all_of: Sequence[Converged]) -> list[dict[str, Any]]:
                 told = f"{np.mean(some):.1f} ({min(some)} to {max(some)})" if some else "never"
                 parts.append(f"{flight}: {told}")
             by_flight[f"by flight, {kind}"] = ", ".join(parts)
+        accepted = [c.accepted for c in mine if c.accepted is not None]
+        row["first accepted fix"] = float(np.mean(accepted)) if accepted else None
+        row["first accepted fix, flights"] = len(accepted)
         rows.append(row | by_flight)
     return rows
 
