@@ -353,7 +353,7 @@ def test_a_run_is_predicted_scored_and_reported_and_goes_on_where_it_was(
     tmp_path: Path, outlines: np.ndarray, maps: Maps
 ) -> None:
     flight = PaperFlight(FLIGHTS[0], (float(CENTRE[0]), float(CENTRE[1])))
-    plan, models, said = Plan(("flight1",), 1, (1,), {"default preset": (1,)}, 1), Models(ERRORS), list[str]()
+    plan, models, said = Plan(("flight1",), 1, (1,), {"default preset": {1: 1}}), Models(ERRORS), list[str]()
     stores = Stores(tmp_path, 1, models)
     stores.ground.save("reference", (ragged(outlines), measured(outlines)))
     stores.maps.save(maps_name(flight, 1), maps)

@@ -47,7 +47,7 @@ ERRORS = SegmentationErrors(
     1, 0.1, 0.05, 0.05, 100.0, 0.2, 30.0, 0.5, 0.0, 0.2, (0.05, 0.05, 0.05, 0.05), 0.6, 1, 0.1, 0.2, 0.5
 )
 FLIGHT = PaperFlight(FLIGHTS[0], (float(CENTRE[0]), float(CENTRE[1])))
-PLAN = Plan(("flight1",), 1, (1,), {}, 0)
+PLAN = Plan(("flight1",), 1, (1,), {})
 
 
 def town(seed: int = 1) -> np.ndarray:

@@ -84,9 +84,7 @@ def test_every_centre_of_tokyo_is_flown_both_ways_round_on_one_track() -> None:
 
 
 def test_a_plan_asks_its_own_methods_for_its_own_prefixes() -> None:
-    plan = Plan(
-        ("tokyo1_over_osm",), 2, (5,), {"default preset": (5,)}, 1, ("default preset", "paper preset")
-    )
+    plan = Plan(("tokyo1_over_osm",), 2, (5,), {"default preset": {5: 1}}, ("default preset", "paper preset"))
     asked = list(queries(tokyo.tokyo_flights()[1], plan, 1))
     assert {query.method for query in asked} == {"default preset", "paper preset"}
     assert [(q.seed, q.method) for q in asked if q.prefixes] == [(1, "default preset")]
@@ -217,7 +215,7 @@ def test_the_report_tells_what_is_real_what_was_left_out_and_what_lost_each_flig
     (tmp_path / "footprints").mkdir()
     methods = ("paper preset", "default preset")
     over = TokyoFlight(1, (float(SITE[0]), float(SITE[1])), "osm", "plateau")
-    plan = Plan((over.name,), 1, (tokyo.RADIUS_KM,), {}, 0, methods)
+    plan = Plan((over.name,), 1, (tokyo.RADIUS_KM,), {}, methods)
     stores = Stores(tmp_path / "tokyo", 1, MODELS, code=tokyo.CODE)
     stores.ground.save(over.name, ragged(reference()))
     stores.ground.save("plateau", (ragged(reference()), measure(reference())))
@@ -225,7 +223,7 @@ def test_the_report_tells_what_is_real_what_was_left_out_and_what_lost_each_flig
     first = two_digitisers(tmp_path, stores, [over], plan, MODELS, 1)
 
     found, left_out = real.networks(real.FLIGHTS, {})
-    plan = Plan((FLIGHT.name,), 1, (6, 12), {}, 0, methods)
+    plan = Plan((FLIGHT.name,), 1, (6, 12), {}, methods)
     stores = real.stores_for(tmp_path, FLIGHT, found["barnarp"], MODELS, 1)
     site = Site(SITE - np.array([240.0, 200.0]), SITE, measure(reference()))
     stores.ground.save(maps_name(FLIGHT, 1), site)

@@ -28,7 +28,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("eval_paper_whole")]
 MILD = SegmentationErrors(
     1, 0.1, 0.05, 0.02, 100.0, 0.1, 30.0, 0.5, 0.0, 0.1, (0.05, 0.05, 0.05, 0.05), 0.6, 1, 0.1, 0.2, 0.5
 )
-PLAN = Plan(("flight1",), 2, (1,), {"default preset": (1,)}, 2)
+PLAN = Plan(("flight1",), 2, (1,), {"default preset": {1: 2}})
 TILES, FIRST = 8, (386_300, 220_700)  # a side of the orthophoto, and the tile of its corner
 DESKTOP_PX = 1280
 

@@ -96,9 +96,9 @@ SHORT = RealFlight("barnarp_short", "barnarp", barnarp, Surveyed(0.6, 450.0, 100
 
 STAR_METHODS = ("paper preset", "default preset")
 FULL = Plan(
-    tuple(flight.name for flight in FLIGHTS), 10, LARGE_RADII_KM, {"default preset": (6,)}, 1, STAR_METHODS
+    tuple(flight.name for flight in FLIGHTS), 10, LARGE_RADII_KM, {"default preset": {6: 1}}, STAR_METHODS
 )  # fmt: skip
-QUICK = Plan((SHORT.name,), 1, (6,), {}, 0, STAR_METHODS)
+QUICK = Plan((SHORT.name,), 1, (6,), {}, STAR_METHODS)
 
 
 def drawn(flight: RealFlight) -> RealFlight:

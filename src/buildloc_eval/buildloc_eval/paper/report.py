@@ -9,6 +9,7 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -201,18 +202,17 @@ class Converged:
 def converged(stores: Stores, flights: Sequence[Flight], plan: Plan, seed: int) -> list[Converged]:
     """Every prefix of every flight that the plan asks for, scored."""
     found = []
-    for flight in flights:
-        for s in range(seed, seed + plan.prefix_seeds):
+    wanted = [(name, *one) for name, seeds in plan.prefixes.items() for one in seeds.items()]
+    for flight, (name, radius, seeds) in product(flights, wanted):
+        for s in range(seed, seed + seeds):
             maps: Maps = stores.maps.load(maps_name(flight, s))
-            for name, radii in plan.prefixes.items():
-                for radius in radii:
-                    prefixes = stores.predictions.load(prediction_name(name, radius, flight, s, True))
-                    scores = [score(p, maps, n, radius) for n, p in enumerate(prefixes, start=1)]
-                    first, stable = first_and_stable([one.rank == 1 for one in scores])
-                    ranks = tuple(one.bin_rank for one in scores)
-                    _, top = first_and_stable([rank == 1 for rank in ranks])
-                    accepted, _ = first_and_stable([one.fix for one in scores])
-                    found.append(Converged(name, radius, s, flight.name, first, stable, ranks, top, accepted))
+            prefixes = stores.predictions.load(prediction_name(name, radius, flight, s, True))
+            scores = [score(p, maps, n, radius) for n, p in enumerate(prefixes, start=1)]
+            first, stable = first_and_stable([one.rank == 1 for one in scores])
+            ranks = tuple(one.bin_rank for one in scores)
+            _, top = first_and_stable([rank == 1 for rank in ranks])
+            accepted, _ = first_and_stable([one.fix for one in scores])
+            found.append(Converged(name, radius, s, flight.name, first, stable, ranks, top, accepted))
     return found
 
 

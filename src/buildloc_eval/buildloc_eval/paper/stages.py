@@ -93,9 +93,8 @@ def queries(flight: Flight, plan: Plan, seed: int) -> Iterator[Query]:
         for name in (n for n in STARS if n in plan.methods):
             for s in range(seed, seed + plan.seeds):
                 yield Query(name, radius, flight, s, prefixes=False)
-            if radius in plan.prefixes.get(name, ()):
-                for s in range(seed, seed + plan.prefix_seeds):
-                    yield Query(name, radius, flight, s, prefixes=True)
+            for s in range(seed, seed + plan.prefixes.get(name, {}).get(radius, 0)):
+                yield Query(name, radius, flight, s, prefixes=True)
 
 
 @dataclass(frozen=True)

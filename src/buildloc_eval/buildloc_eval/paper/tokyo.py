@@ -97,10 +97,10 @@ def tokyo_flights() -> tuple[TokyoFlight, ...]:
 
 
 FULL = Plan(
-    tuple(flight.name for flight in tokyo_flights()), 10, (RADIUS_KM,), {"default preset": (RADIUS_KM,)}, 1,
+    tuple(flight.name for flight in tokyo_flights()), 10, (RADIUS_KM,), {"default preset": {RADIUS_KM: 1}},
     ("paper preset", "default preset"),
 )  # fmt: skip
-QUICK = Plan(FULL.flights[:1], 1, (RADIUS_KM,), {}, 0, FULL.methods)
+QUICK = Plan(FULL.flights[:1], 1, (RADIUS_KM,), {}, FULL.methods)
 
 
 def make_ground(store: Store, flights: Sequence[TokyoFlight], say: Say) -> None:
