@@ -8,7 +8,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 from buildloc_matcher.calibration import Tail
 from buildloc_msgs_py.errors import BuildlocError
@@ -18,7 +17,7 @@ from scipy.stats import beta, chi2
 from buildloc_eval.integrity.plan import CALIBRATION
 from buildloc_eval.integrity.scoring import wrong_best
 
-START_NATS = 0.0  # from where chance and the place are as likely
+START_NATS = 5.0  # the tail begins here: most wrong candidates score less, and say nothing of the highest
 BOUND = 0.95
 FEWEST_ABOVE = 20  # scores of a kind above the start for a scale of its own
 AT_RATE = 1e-4  # where the kinds are compared
@@ -26,7 +25,7 @@ AT_RATE = 1e-4  # where the kinds are compared
 
 def fit_tail(scores: FloatArray, other_scale_nats: float = math.nan) -> Tail:
     """The exponential tail of wrong candidates' scores (N,) above START_NATS: upper bounds of share and
-    scale; with few scores there, the other scale: the largest of the kinds that have enough."""
+    scale; with few scores there, the other scale: that of all kinds together."""
     excess = scores[scores > START_NATS] - START_NATS
     above = len(excess)
     share = float(beta.ppf(BOUND, above + 1, len(scores) - above)) if above < len(scores) else 1.0
@@ -42,11 +41,12 @@ def calibrate(records: pd.DataFrame) -> dict[str, Any]:
     Raises BuildlocError with too few wrong candidates.
     """
     wrong = wrong_best(records)
-    scores = {str(kind): some.score.to_numpy() for kind, some in wrong.groupby("kind")}
-    scales = [fit_tail(some).scale_nats for some in scores.values()]
-    if all(map(math.isnan, scales)):
+    pooled = fit_tail(wrong.score.to_numpy())
+    if math.isnan(pooled.scale_nats):
         raise BuildlocError("too few wrong candidates to calibrate acceptance on; ask for more --trials")
-    tails = {kind: fit_tail(some, float(np.nanmax(scales))) for kind, some in scores.items()}
+    tails = {
+        str(kind): fit_tail(some.score.to_numpy(), pooled.scale_nats) for kind, some in wrong.groupby("kind")
+    }
     worst = max(tails, key=lambda kind: tails[kind].quantile(AT_RATE))
     kinds = {
         kind: {
