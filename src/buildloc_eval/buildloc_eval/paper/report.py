@@ -232,17 +232,23 @@ def convergence_table(all_of: Sequence[Converged]) -> list[dict[str, Any]]:
             row[f"{kind} success_95%"] = mean_interval([float(np.mean(some)) for some in seeds])
             row[f"{kind} success, flights"] = len(reached)
             row[f"{kind} success, paper's"] = None if column is None else published[column]
-            parts = []
-            for flight in dict.fromkeys(c.flight for c in mine):
-                some = [n for c, n in reached if c.flight == flight]
-                told = f"{np.mean(some):.1f} ({min(some)} to {max(some)})" if some else "never"
-                parts.append(f"{flight}: {told}")
-            by_flight[f"by flight, {kind}"] = ", ".join(parts)
+            by_flight[f"by flight, {kind}"] = _by_flight(mine, kind)
         accepted = [c.accepted for c in mine if c.accepted is not None]
         row["first accepted fix"] = float(np.mean(accepted)) if accepted else None
         row["first accepted fix, flights"] = len(accepted)
+        by_flight["by flight, accepted"] = _by_flight(mine, "accepted")
         rows.append(row | by_flight)
     return rows
+
+
+def _by_flight(some: Sequence[Converged], kind: str) -> str:
+    """Of each flight the mean and the ends of the keyframes to ``kind``, over its seeds."""
+    parts = []
+    for flight in dict.fromkeys(c.flight for c in some):
+        found = [getattr(c, kind) for c in some if c.flight == flight and getattr(c, kind) is not None]
+        told = f"{np.mean(found):.1f} ({min(found)} to {max(found)})" if found else "never"
+        parts.append(f"{flight}: {told}")
+    return ", ".join(parts)
 
 
 def acceptance_table(scored: Sequence[Trial], radii_km: Sequence[int]) -> list[dict[str, Any]]:
