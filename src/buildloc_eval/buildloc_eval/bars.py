@@ -31,9 +31,14 @@ class Bar:
 
 
 def judged(value: float | None, limit: float, at_least: bool = False) -> dict[str, Any]:
-    """Limit, measured, held; what was not measured (None) is not held."""
-    held = value is not None and (value >= limit if at_least else value <= limit)
+    """Limit, measured, held."""
+    held = holds(value, limit, at_least)
     return {"at least" if at_least else "at most": limit, "measured": value, "held": held}
+
+
+def holds(value: float | None, limit: float, at_least: bool) -> bool:
+    """Whether a limit is kept; by what was not measured (None) it is not."""
+    return value is not None and (value >= limit if at_least else value <= limit)
 
 
 def judge(bars: Iterable[Bar], sections: dict[str, Scores]) -> Judged:

@@ -22,10 +22,8 @@ OTHER_HALF_SEEN: tuple[Limit, ...] = (
     ("centroid_median_m", 0.35, False),
     ("centroid_p90_m", 1.5, False),
 )
-DENSE, DENSE_SCENE = (
-    "banepa",
-    "banepa_ortho",
-)  # a dense town; its scene whose labels tell touching houses apart
+DENSE = "banepa"  # a dense town
+DENSE_SCENE = "banepa_ortho"  # its scene whose labels tell touching houses apart
 MERGED_OVER_PLAIN = 1.0 / 3.0
 FALL = 0.05  # of the IoU, of disturbed input
 FRAME_MS, QUANTISED_FRAME_MS, MEMORY_MB = 80.0, 55.0, 500.0

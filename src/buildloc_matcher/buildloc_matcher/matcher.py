@@ -195,7 +195,7 @@ class Matcher:
             funnel["lead"] = lead(candidates[0], candidates[1:], config)
             funnel["log_odds"] = candidates[0].acceptance
             funnel["score"] = score(candidates[0], candidates[1:], config)
-        scores = tuple(score for _, score in selected)
+        scores = tuple(found for _, found in selected)
         return MatchResult(candidates, scores, ballot.places_m, query, funnel, clock.seconds)
 
     def _candidate(self, cluster: Cluster, score: Score, centre: FloatArray, query: QueryMap) -> Candidate:
@@ -260,10 +260,8 @@ class Matcher:
             return none(refused)
         poses = _refined(refined)
         seen = seen_in_world(poses, observations, self.config.refine_frames)
-        offset, spread = (
-            refined.position_m - coarse.apply(at_m[None])[0],
-            start_covariance(start_m, self.config),
-        )
+        offset = refined.position_m - coarse.apply(at_m[None])[0]
+        spread = start_covariance(start_m, self.config)
         opinion = ask(seen, offset, spread, self.database.ground, self.config)
         funnel |= {"recent_nats": opinion.nats, "recent_lead": opinion.lead, "recent_buildings": len(seen)}
         if opinion.outcome is not Outcome.ACCEPTED:

@@ -34,7 +34,8 @@ from buildloc_matcher.window import (
     start_sigma_m,
 )
 
-RIVAL_M, MOST_RIVAL_M = 25.0, 60.0  # another optimum is sought within three sigma of the start, but these
+# Another optimum is sought within three sigma of the start, at least and at most so far.
+RIVAL_M, MOST_RIVAL_M = 25.0, 60.0
 RIVAL_CELL_M = 3.0
 RIVAL_TURN_RAD = math.radians(4.0)
 RIVALS = 8  # shifts tried

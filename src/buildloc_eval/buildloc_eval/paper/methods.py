@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,7 @@ from buildloc_matcher.reference.database import ReferenceDatabase, assemble
 from buildloc_matcher.refinement import Refined, refine
 from buildloc_matcher.session import frames_kept
 from buildloc_msgs_py.errors import BuildlocError
-from buildloc_msgs_py.types import FloatArray, NoFix
+from buildloc_msgs_py.types import FloatArray, FrameObservation, NoFix
 from numpy.typing import NDArray
 
 from buildloc_eval.generators import method
@@ -108,7 +108,7 @@ def locate(matcher: Matcher, maps: Maps, keyframes: int, final: bool) -> Predict
     if not final:
         return ranked
     started = time.perf_counter()
-    refined = _refined(matcher, found, maps, snapshot, keyframes)
+    refined = _refined(matcher, found, snapshot, seen)
     seconds = {**ranked.seconds, "refine": time.perf_counter() - started}
     return replace(ranked, final_m=refined, seconds=seconds)
 
@@ -124,11 +124,10 @@ def ranking(matcher: Matcher, found: MatchResult) -> Prediction:
 
 
 def _refined(
-    matcher: Matcher, found: MatchResult, maps: Maps, snapshot: Snapshot, keyframes: int
+    matcher: Matcher, found: MatchResult, snapshot: Snapshot, seen: Sequence[FrameObservation]
 ) -> FloatArray | None:
     last = max(snapshot.keyframes, key=lambda k: k.stamp_ns)
     coarse = matcher.place(found, np.array([last.x_m, last.y_m]))
-    seen = maps.observations[:keyframes][-frames_kept(matcher.config) :]
     refined = refine(coarse, snapshot.keyframes, seen, matcher.database.ground, matcher.config)
     return refined.position_m if isinstance(refined, Refined) else None
 

@@ -17,6 +17,7 @@ import numpy as np
 import shapely
 from buildloc_msgs_py.types import FloatArray
 
+from buildloc_eval.bars import holds
 from buildloc_eval.html import write_report
 from buildloc_eval.machine import machine
 from buildloc_eval.paper import figures
@@ -203,9 +204,12 @@ def converged(stores: Stores, flights: Sequence[Flight], plan: Plan, seed: int) 
     """Every prefix of every flight that the plan asks for, scored."""
     found = []
     wanted = [(name, *one) for name, seeds in plan.prefixes.items() for one in seeds.items()]
-    for flight, (name, radius, seeds) in product(flights, wanted):
-        for s in range(seed, seed + seeds):
-            maps: Maps = stores.maps.load(maps_name(flight, s))
+    most = max((seeds for *_, seeds in wanted), default=0)
+    for flight, s in product(flights, range(seed, seed + most)):
+        maps: Maps = stores.maps.load(maps_name(flight, s))
+        for name, radius, seeds in wanted:
+            if s >= seed + seeds:
+                continue
             prefixes = stores.predictions.load(prediction_name(name, radius, flight, s, True))
             scores = [score(p, maps, n, radius) for n, p in enumerate(prefixes, start=1)]
             first, stable = first_and_stable([one.rank == 1 for one in scores])
@@ -359,9 +363,7 @@ def judged(what: str, bar: float | None, value: float | None, more: bool) -> dic
 
 def held(bar: float | None, value: float | None, more: bool) -> bool | None:
     """Whether a bar is reached, by more or by less; never without a value; None without a bar."""
-    if bar is None:
-        return None
-    return value is not None and (value >= bar if more else value <= bar)
+    return None if bar is None else holds(value, bar, more)
 
 
 def boston(
