@@ -8,7 +8,7 @@ from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.matcher import Matcher
 from buildloc_matcher.reference.database import ReferenceDatabase
 from buildloc_matcher.seeker import Seeker
-from buildloc_matcher.session import frames_kept
+from buildloc_matcher.window import frames_kept
 from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.ground import observe
 from buildloc_msgs_py.types import Fix, Frame, FrameObservation, Mask, NoFix, Tracked

@@ -36,7 +36,7 @@ from buildloc_eval.segmentation_errors import read_errors
 
 KEYFRAME_STEPS = 5  # 25 m
 HALF_FRAME_M = 40.0  # along the path
-FRAMES = 20
+FRAMES = 80  # the latest, that a matcher keeps
 KEYFRAME_PERIOD_NS = 5_000_000_000
 ALTITUDE_M = 100.0
 

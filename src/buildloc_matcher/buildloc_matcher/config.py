@@ -97,14 +97,14 @@ class MatcherConfig:
         5.0, "smallest lead of the refined pose over another one within 20 m that fits too, nats", 0.0, 1e4
     )
     min_buildings: int = param(12, "fewest buildings in the map for a fix", 3, 100000)
-    min_jaccard: float = param(0.2, "smallest MNN-Jaccard of an accepted candidate", 0.0, 1.0)
+    min_jaccard: float = param(0.15, "smallest MNN-Jaccard of an accepted candidate", 0.0, 1.0)
     target_false_fix_rate: float = param(
         1e-4, "how often a map that lies nowhere near may be accepted, at most", 1e-12, 0.5
     )
     rival_distance_m: float = param(15.0, "candidates further away than this are elsewhere, m", 0.0, 1e6)
     min_pairs: int = param(10, "fewest buildings of the map matched for a fix", 3, 100000)
     refine_min_buildings: int = param(
-        5, "fewest distinct reference buildings that the refinement matches for a fix", 3, 1000
+        3, "fewest distinct reference buildings that the refinement matches for a fix", 3, 1000
     )
     max_residual_m: float = param(10.0, "largest RMS distance of the matched pairs for a fix, m", 0.1, 1000.0)
     sigma_up_m: float = param(100.0, "standard deviation reported for the altitude, m", 0.1, 10000.0)
@@ -126,7 +126,7 @@ class MatcherConfig:
     )
     drift_deg_per_km: float = param(3.0, "the same of the heading, deg per km", 0.0, 1000.0)
     max_coast_m: float = param(
-        300.0, "distance without an agreement after which a place is withdrawn, m", 1.0, 1e5
+        800.0, "distance without an agreement after which a place is withdrawn, m", 1.0, 1e5
     )
     max_track_sigma_m: float = param(
         15.0, "standard deviation without an agreement at which a place is withdrawn, m", 0.1, 1000.0

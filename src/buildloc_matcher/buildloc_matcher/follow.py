@@ -64,7 +64,8 @@ def ask(
 ) -> Opinion:
     """What buildings (N, 2) say of the pose that puts them there, ``offset_m`` (2,) away from the prediction,
     whose covariance (3, 3) tells which other places it has to lead."""
-    sigma, gate_m = sigma_m(covariance), GATE_SIGMAS * config.sigma_m
+    # Where the pose has gone far, so may others have.
+    sigma, gate_m = max(sigma_m(covariance), math.hypot(*offset_m) / 2.0), GATE_SIGMAS * config.sigma_m
     shifts = _shifts(sigma, config)
     moves = shifts - offset_m
     nats = placed_evidence(seen_m, reference, config)

@@ -28,27 +28,41 @@ from buildloc_matcher.hypotheses import hypothesize
 from buildloc_matcher.local_map import check_map
 from buildloc_matcher.match_cache import MakeStarMatcher, MatchCache, StarMatcher
 from buildloc_matcher.mesh import Mesh, mesh
-from buildloc_matcher.pursuit import Agreement, Place, Pose, sigmas_apart
+from buildloc_matcher.pursuit import (
+    Agreement,
+    Mode,
+    Place,
+    Pose,
+    Pursuit,
+    agree,
+    carry,
+    prediction,
+    sigmas_apart,
+)
 from buildloc_matcher.reference.buildings import OUTLINE_UNIT_M
 from buildloc_matcher.reference.database import DatabaseError, ReferenceDatabase, descriptor_hash
 from buildloc_matcher.refinement import Refined, Unrefined, covariance_enu, refine, registration_covariance
-from buildloc_matcher.selection import Score, beyond_m, local_transform, select
+from buildloc_matcher.selection import Score, beyond_m, local_transform, pieces_of_one, select
 from buildloc_matcher.voting import Cluster, vote
-from buildloc_matcher.window import start_covariance, start_sigma_m
+from buildloc_matcher.window import Start, State, frames_kept, newest, start
 
 FEWEST_BUILDINGS = 4
 WARM_UP_BUILDINGS = 40
+START_M, START_DEG = 2.5, 1.5  # error of a grown match where its buildings are
+TRIES = 4  # pieces of the flight, from the newest back, that may agree with the reference
+MATCHED_M = 150.0  # with LOCAL_PAIRS matched buildings so near, a keyframe's place is told by the match
 MOST_STARS = 4096  # of one look; those of a map of 100,000 buildings, matched, would fill 30 GB
 
 
 @dataclass(frozen=True)
 class MatchResult:
-    """Candidates, best first, with their scores in the same order; the places (C, 2) m of all bins with
-    consistent votes, most votes first; the funnel counts what came of the stars, and ``seconds`` tells how
+    """Candidates, best first, with their scores in the same order; those of them that contradict the best;
+    the places (C, 2) m of all bins with consistent votes, most votes first; the funnel counts what came of the stars, and ``seconds`` tells how
     long each stage took."""
 
     candidates: tuple[Candidate, ...]
     scores: tuple[Score, ...]
+    rivals: tuple[Candidate, ...]
     voted_m: FloatArray
     query: QueryMap | None
     funnel: dict[str, float]
@@ -131,7 +145,9 @@ class Matcher:
         outlines = None if some.outlines is None else level[:, None] + OUTLINE_UNIT_M * some.outlines
         here = Similarity((0.0, 0.0), (buildings.centroids_m[0, 0], buildings.centroids_m[0, 1]), 0.0)
         seen = FrameObservation(0, level, 100.0, outlines)
-        refine(here, [Keyframe(0, 0.0, 0.0, 0.0)], [seen], self.database.ground, self.config)
+        refine(
+            start(here, [Keyframe(0, 0.0, 0.0, 0.0)], self.config), [seen], self.database.ground, self.config
+        )
 
     def locate(self, local_map: LocalMap) -> MatchResult:
         """Ranked candidates of a map; their x, y is where the mean of the map's buildings lies.
@@ -148,7 +164,7 @@ class Matcher:
             local_map.shapes[usable],
         )
         if len(points) < FEWEST_BUILDINGS:
-            return MatchResult((), (), np.empty((0, 2)), None, {"buildings": len(points)}, clock.seconds)
+            return MatchResult((), (), (), np.empty((0, 2)), None, {"buildings": len(points)}, clock.seconds)
         query = query_map(points, areas)
         for number, look in enumerate(self._looks, start=1):
             with clock.stage("describe"):
@@ -191,12 +207,14 @@ class Matcher:
             "clusters": ballot.consistent,
             "rescored": len(ballot.clusters),
         }
-        if candidates:
-            funnel["lead"] = lead(candidates[0], candidates[1:], config)
-            funnel["log_odds"] = candidates[0].acceptance
-            funnel["score"] = score(candidates[0], candidates[1:], config)
         scores = tuple(found for _, found in selected)
-        return MatchResult(candidates, scores, ballot.places_m, query, funnel, clock.seconds)
+        others = zip(candidates[1:], scores[1:], strict=True)
+        rivals = tuple(one for one, found in others if not pieces_of_one(scores[0], found))
+        if candidates:
+            funnel["lead"] = lead(candidates[0], rivals, config)
+            funnel["log_odds"] = candidates[0].acceptance
+            funnel["score"] = score(candidates[0], rivals, config)
+        return MatchResult(candidates, scores, rivals, ballot.places_m, query, funnel, clock.seconds)
 
     def _candidate(self, cluster: Cluster, score: Score, centre: FloatArray, query: QueryMap) -> Candidate:
         near = local_transform(score, centre, query, self.database.ground, self.config)
@@ -216,12 +234,30 @@ class Matcher:
         if not found.candidates:
             nowhere = "no candidate: no place in the reference gathers enough consistent votes"
             return Verdict(Outcome.REJECTED, f"{Outcome.REJECTED}: {nowhere}", -math.inf, 1.0)
-        return judge_candidate(found.candidates[0], found.candidates[1:], found.scores[0], self.config)
+        return judge_candidate(found.candidates[0], found.rivals, found.scores[0], self.config)
 
     def place(self, found: MatchResult, at_m: FloatArray) -> Similarity:
         """The best candidate's similarity map -> world around a point (2,) of the map."""
         assert found.query is not None
         return local_transform(found.scores[0], at_m, found.query, self.database.ground, self.config)
+
+    def _start(self, found: MatchResult, keyframes: Sequence[Keyframe]) -> Start:
+        """Keyframes, in the order of time, where the best candidate puts each."""
+        query, score, config = found.query, found.scores[0], self.config
+        assert query is not None
+        if config.selection == "rigid":
+            return start(score.transform, keyframes, config)
+        last = newest(keyframes, config.refine_frames)
+        poses = []
+        for keyframe in last:
+            place = np.array([keyframe.x_m, keyframe.y_m])
+            near = self.place(found, place)
+            poses.append((*near.apply(place[None])[0], keyframe.yaw_rad + near.yaw_rad))
+        state = State(np.array(poses), np.array([0.0, math.log(near.scale)]))
+        beyond = beyond_m(score, place, query)
+        walk, turn = math.radians(config.walk_deg), math.radians(START_DEG)
+        sigma_m = math.sqrt(START_M**2 + (turn * beyond) ** 2 + walk**2 * beyond**3 / 3.0)
+        return Start(last, state, sigma_m, math.sqrt(turn**2 + walk**2 * beyond))
 
     def fix(
         self, local_map: LocalMap, keyframes: Sequence[Keyframe], observations: Sequence[FrameObservation]
@@ -247,35 +283,96 @@ class Matcher:
         verdict = self.judge(found)
         if verdict.reason is not None:
             return none(verdict.reason)
-        last = max(keyframes, key=lambda k: k.stamp_ns)
-        at_m, query = np.array([last.x_m, last.y_m]), found.query
+        path = newest(keyframes, frames_kept(self.config))
+        reasons = list[str]()
+        for end in self._ends(found, path):
+            agreed = self._agree(found, path[:end], observations)
+            if isinstance(agreed, str):
+                reasons.append(agreed)
+                continue
+            agreement, figures = agreed
+            caught = self._catch_up(agreement, end, path, observations)
+            if isinstance(caught, str):
+                reasons.append(caught)
+                continue
+            last, (place, agreement) = path[-1], caught
+            funnel |= figures | {"refine_tries": len(reasons) + 1.0}
+            altitude = next((o.altitude_m for o in observations if o.stamp_ns == last.stamp_ns), float("nan"))
+            return Answer(self.fix_at(place, altitude), found.candidates, funnel, agreement)
+        return none(reasons[0])
+
+    def _ends(self, found: MatchResult, path: Sequence[Keyframe]) -> list[int]:
+        """Where pieces of the path end that the reference may agree with, the newest first: the whole, and
+        such as have matched buildings of the best candidate at their end."""
+        config, query = self.config, found.query
         assert query is not None
-        coarse = self.place(found, at_m)
-        start_m = start_sigma_m(self.config, beyond_m(found.scores[0], at_m, query))
-        refined = refine(coarse, keyframes, observations, self.database.ground, self.config, start_m)
+        if config.selection == "rigid":
+            return [len(path)]
+        away = np.array([beyond_m(found.scores[0], np.array([k.x_m, k.y_m]), query) for k in path])
+        near = np.flatnonzero(away <= max(MATCHED_M, away.min())) + 1
+        ends = [len(path)]
+        while len(ends) < TRIES and (before := near[near <= ends[-1] - config.refine_frames // 2]).size:
+            ends.append(int(before[-1]))
+        return ends
+
+    def _agree(
+        self, found: MatchResult, path: Sequence[Keyframe], observations: Sequence[FrameObservation]
+    ) -> tuple[Agreement, dict[str, float]] | str:
+        """What the reference agrees to at the end of a path, by the best candidate, and figures of it; or
+        why it does not."""
+        config = self.config
+        begun = self._start(found, path)
+        refined = refine(begun, observations, self.database.ground, config)
         if isinstance(refined, Unrefined):
-            return none(refined.reason)
-        refused = refuse_refined(refined, self.config)
+            return refined.reason
+        refused = refuse_refined(refined, config)
         if refused is not None:
-            return none(refused)
+            return refused
         poses = _refined(refined)
-        seen = seen_in_world(poses, observations, self.config.refine_frames)
-        offset = refined.position_m - coarse.apply(at_m[None])[0]
-        spread = start_covariance(start_m, self.config)
-        opinion = ask(seen, offset, spread, self.database.ground, self.config)
-        funnel |= {"recent_nats": opinion.nats, "recent_lead": opinion.lead, "recent_buildings": len(seen)}
+        seen = seen_in_world(poses, observations, len(begun.keyframes))
+        offset = refined.position_m - begun.state.poses[-1, :2]
+        opinion = ask(seen, offset, begun.covariance, self.database.ground, config)
         if opinion.outcome is not Outcome.ACCEPTED:
-            return none(f"undecided: the latest frames do not agree: {opinion.reason}")
-        if opinion.lead < self.config.min_recent_lead * len(seen):
+            return f"undecided: the latest frames do not agree: {opinion.reason}"
+        if opinion.lead < config.min_recent_lead * len(seen):
             # Where houses stand close, many a place lays most of them near some house.
             loose = f"lead {opinion.lead:.1f} nats over places near by, for {len(seen)} buildings"
-            return none(f"undecided: the latest frames fit loosely: {loose}")
-        funnel |= {"refine_observed": refined.observed, "refine_pairs": refined.pairs}
-        funnel |= {"refine_buildings": refined.buildings, "refine_rms_m": refined.rms_m}
-        altitude = next((o.altitude_m for o in observations if o.stamp_ns == last.stamp_ns), float("nan"))
-        agreement = Agreement(poses, refined.covariance, coarse.scale)
-        place = Place(last.stamp_ns, *agreement.poses[last.stamp_ns], refined.covariance)
-        return Answer(self.fix_at(place, altitude), found.candidates, funnel, agreement)
+            return f"undecided: the latest frames fit loosely: {loose}"
+        figures = {
+            "recent_nats": opinion.nats, "recent_lead": opinion.lead, "recent_buildings": len(seen),
+            "refine_observed": refined.observed, "refine_pairs": refined.pairs,
+            "refine_buildings": refined.buildings, "refine_rms_m": refined.rms_m,
+        }  # fmt: skip
+        return Agreement(poses, refined.covariance, math.exp(begun.state.log_scales[1])), figures
+
+    def _catch_up(
+        self,
+        agreement: Agreement,
+        known: int,
+        path: Sequence[Keyframe],
+        observations: Sequence[FrameObservation],
+    ) -> tuple[Place, Agreement] | str:
+        """From an agreement about the first ``known`` keyframes of a path to the place of its last one, by
+        following the flight in between; or why that is not known."""
+        config = self.config
+        pursuit = agree(Pursuit(keyframes=tuple(path[:known])), agreement, config)
+        while known < len(path):
+            known = min(known + config.follow_frames, len(path))
+            pursuit = carry(pursuit, path[:known], config)
+            if pursuit.mode is Mode.ACQUIRE:
+                return f"the match ends before the flight: {pursuit.withdrawn}"
+            anchor, last = pursuit.anchors[path[known - 1].stamp_ns], path[known - 1]
+            predicted, uncertainty = prediction(anchor, last), anchor.uncertainty(config)
+            followed = self.follow(predicted, uncertainty, path[:known], observations, pursuit.unanswered)
+            if followed.opinion.outcome is Outcome.REJECTED:
+                return f"the match ends before the flight: {followed.opinion.reason}"
+            if followed.agreement is not None:
+                agreement = followed.agreement
+                pursuit = agree(pursuit, agreement, config)
+        last = path[-1]
+        anchor = pursuit.anchors[last.stamp_ns]
+        place = Place(last.stamp_ns, anchor.x_m, anchor.y_m, anchor.yaw_rad, anchor.uncertainty(config))
+        return place, agreement
 
     def fix_at(self, place: Place, altitude_m: float) -> Fix:
         """The fix of a camera at a place."""
@@ -292,16 +389,19 @@ class Matcher:
         covariance: FloatArray,
         keyframes: Sequence[Keyframe],
         observations: Sequence[FrameObservation],
+        unanswered: int = 0,
     ) -> Followed:
         """Whether the reference agrees that the last keyframe lies where ``predicted`` (map -> world) puts
-        it, up to a covariance (3, 3) over east, north and yaw, the reference's registration included."""
+        it, up to a covariance (3, 3) over east, north and yaw, the reference's registration included; after
+        so many keyframes without an agreement."""
         config, reference = self.config, self.database.ground
         last = max(keyframes, key=lambda k: k.stamp_ns)
-        refined = refine(predicted, keyframes, observations, reference, config)
+        refined = refine(start(predicted, keyframes, config), observations, reference, config)
         poses = _refined(refined) if isinstance(refined, Refined) else _placed(predicted, keyframes)
         offset = np.array(poses[last.stamp_ns]) - np.array(_placed(predicted, [last])[last.stamp_ns])
         offset[2] = wrap(offset[2])
-        seen = seen_in_world(poses, observations, config.follow_frames)
+        frames = min(max(config.follow_frames, unanswered), config.refine_frames)
+        seen = seen_in_world(poses, observations, frames)
         opinion = ask(seen, offset[:2], covariance, reference, config)
         if opinion.outcome is not Outcome.ACCEPTED:
             return Followed(opinion, None)

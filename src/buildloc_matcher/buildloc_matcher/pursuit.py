@@ -41,6 +41,16 @@ class Place:
     covariance: FloatArray
 
 
+def drift_covariance(flown_m: float, config: MatcherConfig) -> FloatArray:
+    """(3, 3) over east, north and yaw of what a flight adds over which the reference said nothing.
+
+    Drift is an error of scale and heading that stays: it grows with the distance, not with its root.
+    """
+    place = config.drift_share * flown_m
+    turn = math.radians(config.drift_deg_per_km) * flown_m * 1e-3
+    return np.diag(np.square([place, place, turn]))
+
+
 @dataclass(frozen=True)
 class Anchor:
     """Where a keyframe is in the world. ``scale``: world metres per metre of its level camera frame.
@@ -57,13 +67,8 @@ class Anchor:
     flown_m: float = 0.0
 
     def uncertainty(self, config: MatcherConfig) -> FloatArray:
-        """(3, 3) covariance east, north, yaw, what the flight since the agreement added included.
-
-        Drift is an error of scale and heading that stays: it grows with the distance, not with its root.
-        """
-        place = config.drift_share * self.flown_m
-        turn = math.radians(config.drift_deg_per_km) * self.flown_m * 1e-3
-        return np.asarray(self.covariance + np.diag([place**2, place**2, turn**2]), dtype=np.float64)
+        """(3, 3) covariance east, north, yaw, what the flight since the agreement added included."""
+        return np.asarray(self.covariance + drift_covariance(self.flown_m, config), dtype=np.float64)
 
     def ahead(self, x_m: float, y_m: float, yaw_rad: float, scale: float) -> Anchor:
         """The anchor of a pose in this one's level camera frame; ``scale`` is that between the two."""
@@ -99,6 +104,11 @@ class Pursuit:
     def since_agreement_m(self) -> float:
         """Distance from the last agreement to the newest keyframe, NaN while acquiring."""
         return self.anchors[max(self.anchors)].flown_m if self.anchors else math.nan
+
+    @property
+    def unanswered(self) -> int:
+        """Keyframes since the last agreement."""
+        return sum(anchor.flown_m > 0.0 for anchor in self.anchors.values())
 
 
 def withdraw(pursuit: Pursuit, reason: str) -> Pursuit:

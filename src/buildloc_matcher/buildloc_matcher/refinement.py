@@ -8,20 +8,22 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from buildloc_msgs_py.types import FloatArray, FrameObservation, Keyframe
+from buildloc_msgs_py.types import FloatArray, FrameObservation
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from buildloc_matcher.config import MatcherConfig
-from buildloc_matcher.evidence import Ground
+from buildloc_matcher.evidence import GATE_SIGMAS, Ground
 from buildloc_matcher.geometry import Similarity, fit_rigid, wrap
 from buildloc_matcher.outline_fit import walls
 from buildloc_matcher.point_grid import within
+from buildloc_matcher.pursuit import drift_covariance
 from buildloc_matcher.reference.buildings import OUTLINE_UNIT_M
 from buildloc_matcher.window import (
     Pairing,
     Pairs,
     Solution,
+    Start,
     State,
     Window,
     associate,
@@ -30,8 +32,6 @@ from buildloc_matcher.window import (
     make_window,
     placed,
     solve,
-    start,
-    start_sigma_m,
 )
 
 # Another optimum is sought within three sigma of the start, at least and at most so far.
@@ -43,6 +43,7 @@ KEPT = (10, 5, 5)  # the best after each rigid step
 SOME = 80  # observations: enough to tell one place from another
 SAME_M = 2.0  # optima nearer than this, or than three sigma, are one
 ONE_BUILDING_M = 3.0
+LATEST_PAIRS = 3  # that tell where the last keyframe is
 
 
 @dataclass(frozen=True)
@@ -73,14 +74,9 @@ NO_BUILDINGS = Unrefined("refinement found no buildings of the recent frames in 
 
 
 def refine(
-    coarse: Similarity,
-    keyframes: Sequence[Keyframe],
-    observations: Sequence[FrameObservation],
-    reference: Ground,
-    config: MatcherConfig,
-    start_m: float | None = None,
+    begun: Start, observations: Sequence[FrameObservation], reference: Ground, config: MatcherConfig
 ) -> Refined | Unrefined:
-    """Correct where ``coarse`` (map -> world) puts the last ``refine_frames`` keyframes.
+    """Correct where a start puts the last keyframes.
 
     All of them are moved as one first, by nearest neighbours within a distance that shrinks from
     ``refine_distance_m`` to ``refine_last_distance_m``; there and at places like it, outlines are put onto
@@ -88,14 +84,11 @@ def refine(
     itself (see :mod:`window`). Refused with fewer than three pairs, or where another place fits nearly as
     well.
     """
-    last = sorted(keyframes, key=lambda k: k.stamp_ns)[-config.refine_frames :]
-    sigma_m = start_sigma_m(config) if start_m is None else start_m
-    window = make_window(last, observations, sigma_m) if last else None
+    window, state = make_window(begun, observations) if begun.keyframes else None, begun.state
     if window is None or not len(window.level_m):
         return NO_BUILDINGS
-    state = start(coarse, last)
     points = placed(window, state)
-    reach_m = min(max(RIVAL_M, 3.0 * sigma_m), MOST_RIVAL_M)
+    reach_m = min(max(RIVAL_M, 3.0 * begun.sigma_m), MOST_RIVAL_M)
     reach = reach_m + config.refine_distance_m
     rows = within(reference.grid, *(points.min(axis=0) - reach), *(points.max(axis=0) + reach))
     if len(rows) < 3:
@@ -118,12 +111,22 @@ def refine(
     if rival_m is not None:
         return Unrefined(f"refinement found two optima {rival_m:.1f} m apart that fit alike")
     covariance = config.sigma_inflation**2 * solution.covariance + registration_covariance(config)
+    covariance += drift_covariance(_unseen_m(window, solution, config), config)
     position, yaw = solution.state.poses[-1, :2], float(wrap(solution.state.poses[-1, 2]))
     return Refined(
         position, yaw, covariance, dict(zip(window.stamps_ns, solution.state.poses, strict=True)),
         len(window.level_m), len(solution.pairs), solution.pairs.seen,
         math.sqrt(float(np.mean(np.sum(solution.residuals_m**2, axis=1)))),
     )  # fmt: skip
+
+
+def _unseen_m(window: Window, solution: Solution, config: MatcherConfig) -> float:
+    """How far the last keyframe is along the path from the latest buildings that were found."""
+    sigma_m = solution.growth * math.hypot(config.sigma_frame_m, config.sigma_building_m)
+    near = np.hypot(*solution.residuals_m.T) < GATE_SIGMAS * sigma_m
+    frames = np.sort(window.frames[solution.pairs.rows[near]])
+    latest = frames[-min(LATEST_PAIRS, len(frames))] if len(frames) else 0
+    return float(np.hypot(*window.steps[latest:, :2].T).sum())
 
 
 def _pairings(
@@ -174,7 +177,9 @@ class _Optima:
         told = np.einsum("pi,pij,pj->p", apart, pairs.certainty, apart)
         costs = np.full(len(self._weights), alone)
         costs[pairs.rows] += pairs.covered * np.minimum(0.0, cauchy(told / sigma_m**2) - alone)
-        away = (state.poses - self._coarse.poses)[-1, :2] / self._window.start_m
+        away = (state.poses - self._coarse.poses)[-1]
+        away[2] = wrap(away[2])
+        away /= (self._window.start_m, self._window.start_m, self._window.start_rad)
         return float(self._weights @ costs + 0.5 * away @ away)
 
     def rival_m(self, solution: Solution) -> float | None:

@@ -103,7 +103,7 @@ class Seeker:
         if last is None or anchor is None:
             answer, step = self._acquire(local_map, keyframes, observations)
         else:
-            answer, step = self._follow(anchor, last, local_map, keyframes, observations)
+            answer, step = self._follow(anchor, pursuit.unanswered, last, local_map, keyframes, observations)
         with self._lock:
             if flight is not self._flight:
                 return Answer(NoFix(local_map.stamp_ns, "the flight was forgotten meanwhile"), (), {})
@@ -132,6 +132,7 @@ class Seeker:
     def _follow(
         self,
         anchor: Anchor,
+        unanswered: int,
         last: Keyframe,
         local_map: LocalMap,
         keyframes: Sequence[Keyframe],
@@ -146,7 +147,8 @@ class Seeker:
                 none = NoFix(last.stamp_ns, elsewhere)
                 return Answer(none, found.candidates, found.funnel), partial(withdraw, reason=elsewhere)
         uncertainty = anchor.uncertainty(config)
-        followed = matcher.follow(prediction(anchor, last), uncertainty, keyframes, observations)
+        predicted = prediction(anchor, last)
+        followed = matcher.follow(predicted, uncertainty, keyframes, observations, unanswered)
         opinion, agreement = followed.opinion, followed.agreement
         funnel = {"follow_nats": opinion.nats, "follow_lead": opinion.lead}
         if opinion.outcome is Outcome.REJECTED:

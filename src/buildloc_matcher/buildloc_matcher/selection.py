@@ -31,6 +31,7 @@ GROWN_SCORED = 10  # distinct grown matches that get the full score
 NEGLIGIBLE_NATS = 60.0  # a match that much less likely than the best is not listed
 LOCAL_M = 100.0  # pairs around a place that tell how the map lies there, and how many it takes
 LOCAL_PAIRS = 6
+TORN_M, CONTRADICTIONS = 100.0, 0.4  # how far the pieces of a match lie apart, and how often they disagree
 SHIFT_M = 100.0  # how far a match is moved to see whether it fits as well there
 
 
@@ -204,6 +205,16 @@ def shifted(places_m: FloatArray, reference: Ground, config: MatcherConfig) -> F
             if min(hits) >= 0 and len(set(hits)) == len(hits):
                 found.append(grid.points_m[hits])
     return np.array(found).reshape(-1, 3, 2)
+
+
+def pieces_of_one(one: Score, other: Score) -> bool:
+    """Whether two matches are pieces of one that the map's bend has torn: they lie near each other, and
+    seldom match a building of the map with different ones of the reference."""
+    if _apart(one, other) > TORN_M:
+        return False
+    _, ours, theirs = np.intersect1d(one.pairs[:, 0], other.pairs[:, 0], return_indices=True)
+    contradictions = np.count_nonzero(one.pairs[ours, 1] != other.pairs[theirs, 1])
+    return bool(contradictions < CONTRADICTIONS * min(len(one.pairs), len(other.pairs)))
 
 
 def _start(cluster: Cluster, query: QueryMap) -> Similarity:

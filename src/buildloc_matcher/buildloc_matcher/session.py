@@ -16,13 +16,9 @@ from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.matcher import Answer, Matcher
 from buildloc_matcher.reference.database import open_database
 from buildloc_matcher.seeker import Seeker
+from buildloc_matcher.window import frames_kept
 
 PENDING = 10
-
-
-def frames_kept(config: MatcherConfig) -> int:
-    """Observations worth keeping: some of the latest frames may have found no place in the map."""
-    return 4 * config.refine_frames
 
 
 @dataclass(frozen=True)

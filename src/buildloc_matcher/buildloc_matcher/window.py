@@ -34,8 +34,8 @@ class Window:
 
     ``steps`` (K-1, 3) is the mapper's pose of each keyframe in the axes of the one before; ``frames`` (N,)
     the keyframe of an observation, rising, and ``level_m`` (N, 2) its place in the level camera frame;
-    ``outlines_m`` (N, P, 2) points of its outline there, or None. ``start_m``: the standard deviation per
-    axis of where the last keyframe is thought to be.
+    ``outlines_m`` (N, P, 2) points of its outline there, or None. ``start_m``, ``start_rad``: the standard
+    deviations, per axis and of the heading, of where the last keyframe is thought to be.
     """
 
     stamps_ns: tuple[int, ...]
@@ -44,6 +44,7 @@ class Window:
     level_m: FloatArray
     outlines_m: FloatArray | None
     start_m: float
+    start_rad: float
 
     def thinned(self, rows: NDArray[np.int64]) -> Window:
         """All keyframes with some of the observations, and half of the points of their outlines."""
@@ -94,11 +95,10 @@ class Solution:
     growth: float
 
 
-def make_window(
-    keyframes: Sequence[Keyframe], observations: Sequence[FrameObservation], start_m: float
-) -> Window:
-    """The window of keyframes, sorted by time and at least one; observations of other frames are left out."""
+def make_window(begun: Start, observations: Sequence[FrameObservation]) -> Window:
+    """The window of a start's keyframes, at least one; observations of other frames are left out."""
     of_frame = {o.stamp_ns: o for o in observations if len(o.centroids_m)}
+    keyframes = begun.keyframes
     found = [of_frame.get(k.stamp_ns) for k in keyframes]
     seen = [np.empty((0, 2)) if one is None else one.centroids_m for one in found]
     outlines = [one.outlines_m for one in found if one is not None]
@@ -109,26 +109,43 @@ def make_window(
     frames = np.repeat(np.arange(len(keyframes)), [len(one) for one in seen])
     around = np.concatenate(known) if known and len(known) == len(outlines) else None
     stamps = tuple(k.stamp_ns for k in keyframes)
-    return Window(stamps, steps, frames, np.concatenate(seen), around, start_m)
+    return Window(stamps, steps, frames, np.concatenate(seen), around, begun.sigma_m, begun.sigma_rad)
 
 
-def start(coarse: Similarity, keyframes: Sequence[Keyframe]) -> State:
-    """Where a similarity map -> world puts the keyframes; what frames saw keeps the altimeter's scale."""
-    poses = np.array([[k.x_m, k.y_m, k.yaw_rad] for k in keyframes])
+@dataclass(frozen=True)
+class Start:
+    """Where a fit begins: keyframes in the order of time, where they are thought to be, and the standard
+    deviations of the last one's place per axis and of its heading."""
+
+    keyframes: tuple[Keyframe, ...]
+    state: State
+    sigma_m: float
+    sigma_rad: float
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(3, 3) of the last pose over east, north and yaw."""
+        return np.diag(np.square([self.sigma_m, self.sigma_m, self.sigma_rad]))
+
+
+def start(coarse: Similarity, keyframes: Sequence[Keyframe], config: MatcherConfig) -> Start:
+    """The last ``refine_frames`` keyframes where a similarity map -> world puts them; what frames saw keeps
+    the altimeter's scale. Buildings are sought within three sigma."""
+    last = newest(keyframes, config.refine_frames)
+    poses = np.array([[k.x_m, k.y_m, k.yaw_rad] for k in last]).reshape(-1, 3)
     placed = np.column_stack([coarse.apply(poses[:, :2]), poses[:, 2] + coarse.yaw_rad])
-    return State(placed, np.array([0.0, math.log(coarse.scale)]))
+    state = State(placed, np.array([0.0, math.log(coarse.scale)]))
+    return Start(last, state, config.refine_distance_m / 3.0, math.radians(config.rotation_tolerance_deg))
 
 
-def start_sigma_m(config: MatcherConfig, beyond_m: float = 0.0) -> float:
-    """Error of a start that far from what it goes by, per axis: its buildings are sought within three of
-    them. A heading that walks at random leads aside with the power 3/2 of the distance."""
-    strayed = math.radians(config.walk_deg) ** 2 * beyond_m**3 / 3.0
-    return math.sqrt((config.refine_distance_m / 3.0) ** 2 + strayed)
+def frames_kept(config: MatcherConfig) -> int:
+    """The most keyframes that a window can need."""
+    return 4 * config.refine_frames
 
 
-def start_covariance(start_m: float, config: MatcherConfig) -> FloatArray:
-    """(3, 3) of the start's last pose over east, north and yaw."""
-    return np.diag(np.square([start_m, start_m, math.radians(config.rotation_tolerance_deg)]))
+def newest(keyframes: Sequence[Keyframe], count: int) -> tuple[Keyframe, ...]:
+    """The last keyframes, in the order of time."""
+    return tuple(sorted(keyframes, key=lambda k: k.stamp_ns)[-count:])
 
 
 def placed(window: Window, state: State) -> FloatArray:
@@ -203,7 +220,7 @@ class _Fit:
     def __init__(
         self, window: Window, state: State, first: State, pairs: Pairs, growth: float, config: MatcherConfig
     ) -> None:
-        self._state, self._first, self._config, self._start_m = state, first, config, window.start_m
+        self._state, self._first, self._config, self._window = state, first, config, window
         frames = window.frames[pairs.rows]
         turned = _turned(window.level_m[pairs.rows], state.poses[frames, 2])
         self._arms = math.exp(state.log_scales[0]) * turned
@@ -273,8 +290,8 @@ class _Fit:
     def _prior(self) -> FloatArray:
         """(3 K + 2,) information of the start, which is weak, about the last pose, and of both scales."""
         information = np.zeros(3 * len(self._of_frame) + 2)
-        turn, scale = math.radians(self._config.rotation_tolerance_deg), self._config.sigma_scale
-        information[-5:] = 1.0 / np.square([self._start_m, self._start_m, turn, scale, scale])
+        place, turn, scale = self._window.start_m, self._window.start_rad, self._config.sigma_scale
+        information[-5:] = 1.0 / np.square([place, place, turn, scale, scale])
         return information
 
     def information(self, weights: FloatArray) -> FloatArray:

@@ -12,9 +12,9 @@ from buildloc_matcher.matcher import Matcher, MatchResult
 from buildloc_matcher.reference.buildings import Buildings
 from buildloc_matcher.reference.database import ReferenceDatabase, assemble
 from buildloc_matcher.refinement import Refined, refine
-from buildloc_matcher.session import frames_kept
+from buildloc_matcher.window import frames_kept, start
 from buildloc_msgs_py.errors import BuildlocError
-from buildloc_msgs_py.types import FloatArray, FrameObservation, NoFix
+from buildloc_msgs_py.types import Fix, FloatArray, FrameObservation, NoFix
 from numpy.typing import NDArray
 
 from buildloc_eval.generators import method
@@ -103,12 +103,12 @@ def locate(matcher: Matcher, maps: Maps, keyframes: int, final: bool) -> Predict
     if not found.candidates:
         return ranked
     seen = maps.observations[:keyframes][-frames_kept(matcher.config) :]
+    started = time.perf_counter()
     answer = matcher.conclude(found, snapshot.local_map.stamp_ns, snapshot.keyframes, seen).result
     ranked = replace(ranked, refused=answer.reason if isinstance(answer, NoFix) else None)
     if not final:
         return ranked
-    started = time.perf_counter()
-    refined = _refined(matcher, found, snapshot, seen)
+    refined = _refined(matcher, found, snapshot, seen) if isinstance(answer, NoFix) else _place_m(answer)
     seconds = {**ranked.seconds, "refine": time.perf_counter() - started}
     return replace(ranked, final_m=refined, seconds=seconds)
 
@@ -128,8 +128,13 @@ def _refined(
 ) -> FloatArray | None:
     last = max(snapshot.keyframes, key=lambda k: k.stamp_ns)
     coarse = matcher.place(found, np.array([last.x_m, last.y_m]))
-    refined = refine(coarse, snapshot.keyframes, seen, matcher.database.ground, matcher.config)
+    begun = start(coarse, snapshot.keyframes, matcher.config)
+    refined = refine(begun, seen, matcher.database.ground, matcher.config)
     return refined.position_m if isinstance(refined, Refined) else None
+
+
+def _place_m(fix: Fix) -> FloatArray:
+    return np.array([fix.easting_m, fix.northing_m])
 
 
 def brm_survivors(reference: brm.RatioMap, maps: Maps) -> tuple[brm.Survivors, float]:
