@@ -57,8 +57,8 @@ MOST_STARS = 4096  # of one look; those of a map of 100,000 buildings, matched, 
 @dataclass(frozen=True)
 class MatchResult:
     """Candidates, best first, with their scores in the same order; those of them that contradict the best;
-    the places (C, 2) m of all bins with consistent votes, most votes first; the funnel counts what came of the stars, and ``seconds`` tells how
-    long each stage took."""
+    the places (C, 2) m of all bins with consistent votes, most votes first; the funnel counts what came of
+    the stars, and ``seconds`` tells how long each stage took."""
 
     candidates: tuple[Candidate, ...]
     scores: tuple[Score, ...]

@@ -10,6 +10,7 @@ from buildloc_matcher.geometry import Similarity, rotation
 from buildloc_matcher.outline_fit import Walls, align, walls
 from buildloc_matcher.reference.buildings import OUTLINE_UNIT_M, stored_outlines
 from buildloc_matcher.refinement import Refined, Unrefined, refine
+from buildloc_matcher.window import start
 from buildloc_msgs_py.ground import OUTLINE_POINTS
 from buildloc_msgs_py.types import FloatArray, FrameObservation, Keyframe
 from numpy.typing import NDArray
@@ -104,9 +105,9 @@ def test_merged_pairs_are_placed_by_their_walls(seed: int) -> None:
     centroids, areas = shapely.get_coordinates(shapely.centroid(houses.ravel())), np.full(72, 100.0)
     outlined = ground(centroids, areas, stored_outlines(houses.ravel(), centroids))
     last, begun = (poses[-1].x_m, poses[-1].y_m), Similarity((0.0, 0.0), (1.5, -1.0), 0.0)
-    refined = refine(begun, poses, seen, outlined, DEFAULT)
+    refined = refine(start(begun, poses, DEFAULT), seen, outlined, DEFAULT)
     assert isinstance(refined, Refined), refined
     np.testing.assert_allclose(refined.position_m, last, atol=0.2)
     # The middle of two houses is the place of neither: without walls that is metres or a refusal.
-    without = refine(begun, poses, seen, ground(centroids, areas), DEFAULT)
+    without = refine(start(begun, poses, DEFAULT), seen, ground(centroids, areas), DEFAULT)
     assert isinstance(without, Unrefined) or np.hypot(*(without.position_m - last)) > 1.0

@@ -53,7 +53,7 @@ def coarse(x_m: float, y_m: float, turn_deg: float) -> Similarity:
 def test_a_shift_and_a_turn_are_recovered(heading: float, away: float, turn: float) -> None:
     # 8 m and 1.5 degrees over 380 m: within the 15 m in which the nearest building is mostly the right one.
     begun = coarse(away * math.cos(heading), away * math.sin(heading), turn)
-    refined = refined_of(refine(begun, POSES, SEEN, GROUND, DEFAULT))
+    refined = refined_of(refine(start(begun, POSES, DEFAULT), SEEN, GROUND, DEFAULT))
     # Noise of 0.3 m, averaged over hundreds of pairs.
     np.testing.assert_allclose(refined.position_m, LAST, atol=0.5)
     assert float(wrap(refined.yaw_rad - POSES[-1].yaw_rad)) == pytest.approx(0.0, abs=0.005)
@@ -64,27 +64,28 @@ def test_a_shift_and_a_turn_are_recovered(heading: float, away: float, turn: flo
 def test_the_paper_reaches_further() -> None:
     config = matcher_config({"preset": "paper"})
     assert (config.refine_distance_m, config.refine_frames) == (50.0, 20)
-    refined = refined_of(refine(coarse(4.0, -3.0, 0.5), POSES, SEEN, GROUND, config))
+    refined = refined_of(refine(start(coarse(4.0, -3.0, 0.5), POSES, config), SEEN, GROUND, config))
     # Wrong pairs within 15 m stay in the last step and pull a little.
     np.testing.assert_allclose(refined.position_m, LAST, atol=1.5)
 
 
 def test_only_the_last_frames_with_a_pose_count() -> None:
     few = replace(DEFAULT, refine_frames=5)
-    refined = refined_of(refine(coarse(2.0, 1.0, 0.2), POSES, SEEN, GROUND, few))
+    refined = refined_of(refine(start(coarse(2.0, 1.0, 0.2), POSES, few), SEEN, GROUND, few))
     assert refined.observed == sum(len(s.centroids_m) for s in SEEN[-5:])
     assert list(refined.poses) == [pose.stamp_ns for pose in POSES[-5:]]
     np.testing.assert_array_equal(refined.poses[POSES[-1].stamp_ns][:2], refined.position_m)
     stray = [FrameObservation(99 * SECOND, np.zeros((50, 2)), 105.0), *SEEN[::-1]]
-    again = refined_of(refine(coarse(2.0, 1.0, 0.2), POSES[::-1], stray, GROUND, few))
+    again = refined_of(refine(start(coarse(2.0, 1.0, 0.2), POSES[::-1], few), stray, GROUND, few))
     np.testing.assert_allclose(again.position_m, refined.position_m, atol=1e-9)
 
 
 def test_frames_lie_in_the_world_where_the_coarse_pose_puts_them() -> None:
-    points = placed(make_window(POSES, frames_of(POSES, 0.0), 5.0), start(coarse(0.0, 0.0, 0.0), POSES))
+    begun = start(coarse(0.0, 0.0, 0.0), POSES, DEFAULT)
+    points = placed(make_window(begun, frames_of(POSES, 0.0)), begun.state)
     apart = np.hypot(*(points[:, None] - CITY[None]).transpose(2, 0, 1)).min(axis=1)
     assert len(points) > 500 and apart.max() < 1e-9
-    assert len(make_window(POSES, [], 5.0).level_m) == 0
+    assert len(make_window(begun, []).level_m) == 0
 
 
 def test_invented_and_missing_buildings_pull_little() -> None:
@@ -94,7 +95,7 @@ def test_invented_and_missing_buildings_pull_little() -> None:
         for s in SEEN
     ]
     fewer = alike(CITY[rng.random(len(CITY)) > 0.2])
-    refined = refined_of(refine(coarse(3.0, 2.0, 0.5), POSES, seen, fewer, DEFAULT))
+    refined = refined_of(refine(start(coarse(3.0, 2.0, 0.5), POSES, DEFAULT), seen, fewer, DEFAULT))
     np.testing.assert_allclose(refined.position_m, LAST, atol=0.5)
     assert refined.pairs < 0.9 * refined.observed
 
@@ -111,7 +112,7 @@ def test_a_map_that_bends_is_followed_to_the_last_frame() -> None:
         for pose, (x, y), angle in zip(POSES, bent, drift, strict=True)
     ]
     to_map = fit_rigid(bent, path)
-    refined = refined_of(refine(to_map, poses, SEEN, GROUND, DEFAULT))
+    refined = refined_of(refine(start(to_map, poses, DEFAULT), SEEN, GROUND, DEFAULT))
     assert np.hypot(*(to_map.apply(bent[-1:])[0] - LAST)) > 1.5
     np.testing.assert_allclose(refined.position_m, LAST, atol=0.5)
     for pose in POSES:
@@ -126,14 +127,14 @@ def test_two_optima_are_refused() -> None:
     level = [street - [pose.x_m, pose.y_m] for pose in poses]
     near = [one[np.abs(one).max(axis=1) < 40.0] for one in level]
     seen = [FrameObservation(pose.stamp_ns, one, 100.0) for pose, one in zip(poses, near, strict=True)]
-    start = Similarity((0.0, 0.0), (1.0, 1.0), 0.0)
-    refused = refine(start, poses, seen, alike(street), DEFAULT)
+    begun = start(Similarity((0.0, 0.0), (1.0, 1.0), 0.0), poses, DEFAULT)
+    refused = refine(begun, seen, alike(street), DEFAULT)
     assert isinstance(refused, Unrefined) and "two optima 14.0 m apart" in refused.reason
     # Without the house next to every second one there is one place only.
     uneven = street[np.random.default_rng(1).random(len(street)) < 0.6]
     near = [one[np.abs(one).max(axis=1) < 40.0] for one in (uneven - [p.x_m, p.y_m] for p in poses)]
     seen = [FrameObservation(pose.stamp_ns, one, 100.0) for pose, one in zip(poses, near, strict=True)]
-    assert isinstance(refine(start, poses, seen, alike(uneven), DEFAULT), Refined)
+    assert isinstance(refine(begun, seen, alike(uneven), DEFAULT), Refined)
 
 
 def normalised_squares(seed: int) -> FloatArray:
@@ -143,8 +144,8 @@ def normalised_squares(seed: int) -> FloatArray:
     squares = []
     for _ in range(60):
         world = CITY + rng.normal(0.0, shared, CITY.shape)
-        start, step = rng.uniform(250.0, 600.0, 2), rng.uniform(-15.0, 15.0, 2)
-        true, mapped = [np.array([*start, 0.0])], [np.zeros(3)]
+        first, step = rng.uniform(250.0, 600.0, 2), rng.uniform(-15.0, 15.0, 2)
+        true, mapped = [np.array([*first, 0.0])], [np.zeros(3)]
         for _ in range(7):
             true.append(true[-1] + [*step, 0.1])
             root = math.sqrt(np.hypot(*step))
@@ -161,7 +162,7 @@ def normalised_squares(seed: int) -> FloatArray:
         last, end = poses[-1], true[-1]
         place = tuple((end[:2] + rng.normal(0.0, 1.5, 2)).tolist())
         begun = Similarity((last.x_m, last.y_m), (place[0], place[1]), float(end[2]) - last.yaw_rad)
-        refined = refined_of(refine(begun, poses, seen, alike(CITY), config))
+        refined = refined_of(refine(start(begun, poses, config), seen, alike(CITY), config))
         error = np.array([*refined.position_m, refined.yaw_rad]) - end
         squares.append(float(error @ np.linalg.solve(refined.covariance, error)))
     return np.array(squares)
@@ -179,18 +180,18 @@ def test_what_gives_no_refined_pose() -> None:
     begun = coarse(1.0, 1.0, 0.0)
     two = [FrameObservation(SEEN[-1].stamp_ns, SEEN[-1].centroids_m[:2], 105.0)]
     one_house = alike(np.array([[9e3, 9e3], LAST]))
-    for arguments in (
+    for poses, seen, reference in (
         ([], SEEN, GROUND), (POSES, [], GROUND), (POSES, two, GROUND), (POSES, SEEN, alike(CITY + 5000.0)),
         (POSES, SEEN[-1:], one_house),
     ):  # fmt: skip
-        none = refine(begun, *arguments, DEFAULT)
+        none = refine(start(begun, poses, DEFAULT), seen, reference, DEFAULT)
         assert isinstance(none, Unrefined) and "found no buildings of the recent frames" in none.reason
 
 
 def test_the_covariance_counts_the_registration_of_the_reference() -> None:
     begun, registered = coarse(1.0, 1.0, 0.1), replace(DEFAULT, sigma_registration_m=0.0)
-    exact = refined_of(refine(begun, POSES, SEEN, GROUND, registered))
-    refined = refined_of(refine(begun, POSES, SEEN, GROUND, DEFAULT))
+    exact = refined_of(refine(start(begun, POSES, DEFAULT), SEEN, GROUND, registered))
+    refined = refined_of(refine(start(begun, POSES, DEFAULT), SEEN, GROUND, DEFAULT))
     np.testing.assert_allclose(refined.covariance - exact.covariance, np.diag([2.25, 2.25, 0.0]), atol=1e-12)
     covariance = covariance_enu(refined.covariance, DEFAULT)
     np.testing.assert_array_equal(covariance[:2, :2], refined.covariance[:2, :2])

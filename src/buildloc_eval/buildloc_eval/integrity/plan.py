@@ -15,7 +15,7 @@ FLIGHT = "flight"  # over ground that the reference holds as it is: four of five
 CONTROLS = (
     "outside", "another city", "mirrored", "missing", "shifted", "grid suburbs", "snow", "scaled",
 )  # fmt: skip
-PAPER_EVERY = 11  # not a multiple of how often controls come: every kind has its share
+PAPER_EVERY = 31  # not a multiple of how often controls come: every kind has its share
 CHUNK = 100  # trials with consecutive numbers are of one region
 
 BUILDINGS = (20, 40, 60, 100, 200)
