@@ -27,6 +27,7 @@ from buildloc_matcher.geometry import Similarity, wrap
 from buildloc_matcher.hypotheses import hypothesize
 from buildloc_matcher.local_map import check_map
 from buildloc_matcher.match_cache import MakeStarMatcher, MatchCache, StarMatcher
+from buildloc_matcher.match_start import ends, start_of
 from buildloc_matcher.mesh import Mesh, mesh
 from buildloc_matcher.pursuit import (
     Agreement,
@@ -42,15 +43,12 @@ from buildloc_matcher.pursuit import (
 from buildloc_matcher.reference.buildings import OUTLINE_UNIT_M
 from buildloc_matcher.reference.database import DatabaseError, ReferenceDatabase, descriptor_hash
 from buildloc_matcher.refinement import Refined, Unrefined, covariance_enu, refine, registration_covariance
-from buildloc_matcher.selection import Score, beyond_m, local_transform, pieces_of_one, select
+from buildloc_matcher.selection import Score, local_transform, pieces_of_one, select
 from buildloc_matcher.voting import Cluster, vote
-from buildloc_matcher.window import Start, State, frames_kept, newest, start
+from buildloc_matcher.window import frames_kept, newest, start
 
 FEWEST_BUILDINGS = 4
 WARM_UP_BUILDINGS = 40
-START_M, START_DEG = 2.5, 1.5  # error of a grown match where its buildings are
-TRIES = 4  # pieces of the flight, from the newest back, that may agree with the reference
-MATCHED_M = 150.0  # with LOCAL_PAIRS matched buildings so near, a keyframe's place is told by the match
 MOST_STARS = 4096  # of one look; those of a map of 100,000 buildings, matched, would fill 30 GB
 
 
@@ -241,24 +239,6 @@ class Matcher:
         assert found.query is not None
         return local_transform(found.scores[0], at_m, found.query, self.database.ground, self.config)
 
-    def _start(self, found: MatchResult, keyframes: Sequence[Keyframe]) -> Start:
-        """Keyframes, in the order of time, where the best candidate puts each."""
-        query, score, config = found.query, found.scores[0], self.config
-        assert query is not None
-        if config.selection == "rigid":
-            return start(score.transform, keyframes, config)
-        last = newest(keyframes, config.refine_frames)
-        poses = []
-        for keyframe in last:
-            place = np.array([keyframe.x_m, keyframe.y_m])
-            near = self.place(found, place)
-            poses.append((*near.apply(place[None])[0], keyframe.yaw_rad + near.yaw_rad))
-        state = State(np.array(poses), np.array([0.0, math.log(near.scale)]))
-        beyond = beyond_m(score, place, query)
-        walk, turn = math.radians(config.walk_deg), math.radians(START_DEG)
-        sigma_m = math.sqrt(START_M**2 + (turn * beyond) ** 2 + walk**2 * beyond**3 / 3.0)
-        return Start(last, state, sigma_m, math.sqrt(turn**2 + walk**2 * beyond))
-
     def fix(
         self, local_map: LocalMap, keyframes: Sequence[Keyframe], observations: Sequence[FrameObservation]
     ) -> Answer:
@@ -283,9 +263,9 @@ class Matcher:
         verdict = self.judge(found)
         if verdict.reason is not None:
             return none(verdict.reason)
-        path = newest(keyframes, frames_kept(self.config))
-        reasons = list[str]()
-        for end in self._ends(found, path):
+        path, reasons = newest(keyframes, frames_kept(self.config)), list[str]()
+        assert found.query is not None
+        for end in ends(found.scores[0], found.query, path, self.config):
             agreed = self._agree(found, path[:end], observations)
             if isinstance(agreed, str):
                 reasons.append(agreed)
@@ -301,27 +281,14 @@ class Matcher:
             return Answer(self.fix_at(place, altitude), found.candidates, funnel, agreement)
         return none(reasons[0])
 
-    def _ends(self, found: MatchResult, path: Sequence[Keyframe]) -> list[int]:
-        """Where pieces of the path end that the reference may agree with, the newest first: the whole, and
-        such as have matched buildings of the best candidate at their end."""
-        config, query = self.config, found.query
-        assert query is not None
-        if config.selection == "rigid":
-            return [len(path)]
-        away = np.array([beyond_m(found.scores[0], np.array([k.x_m, k.y_m]), query) for k in path])
-        near = np.flatnonzero(away <= max(MATCHED_M, away.min())) + 1
-        ends = [len(path)]
-        while len(ends) < TRIES and (before := near[near <= ends[-1] - config.refine_frames // 2]).size:
-            ends.append(int(before[-1]))
-        return ends
-
     def _agree(
         self, found: MatchResult, path: Sequence[Keyframe], observations: Sequence[FrameObservation]
     ) -> tuple[Agreement, dict[str, float]] | str:
         """What the reference agrees to at the end of a path, by the best candidate, and figures of it; or
         why it does not."""
         config = self.config
-        begun = self._start(found, path)
+        assert found.query is not None
+        begun = start_of(found.scores[0], found.query, path, self.database.ground, config)
         refined = refine(begun, observations, self.database.ground, config)
         if isinstance(refined, Unrefined):
             return refined.reason

@@ -118,7 +118,7 @@ def test_each_figure_of_the_refinement_that_falls_short_is_named() -> None:
     good = Refined(np.zeros(2), 0.0, np.eye(3), {}, 50, 40, 20, 2.0)
     assert refuse_refined(good, CONFIG) is None
     for refined, text in (
-        (replace(good, buildings=4), "matched 4 buildings, fewer than 5"),
+        (replace(good, buildings=2), "matched 2 buildings, fewer than 3"),
         (replace(good, rms_m=11.0), "residuals of 11.0 m, above 10 m"),
     ):
         reason = refuse_refined(refined, CONFIG)

@@ -109,6 +109,31 @@ def test_a_better_place_within_the_uncertainty_is_a_disagreement() -> None:
     assert opinion.outcome is Outcome.REJECTED and "near by fits better" in opinion.reason
 
 
+def test_a_pose_that_went_far_has_to_lead_places_as_far_again() -> None:
+    """A start that was sure of itself, and wrong by two houses, is no reason against the right place; but
+    places around are asked then that such a start would not have left open."""
+    seen = seen_in_world({k.stamp_ns: _pose(k) for k in KEYFRAMES}, frames(TOWN), 8)
+    opinion = ask(seen, np.array([40.0, 0.0]), SURE, MATCHER.database.ground, DEFAULT)
+    assert opinion.outcome is Outcome.ACCEPTED
+    grid = lattice(30, 30, 24.0)
+    middle = grid.centroids_m.mean(axis=0)
+    near = np.asarray(grid.centroids_m[np.abs(grid.centroids_m - middle).max(axis=1) < 60.0])
+    street = alike(grid.centroids_m)
+    assert ask(near, np.zeros(2), SURE, street, DEFAULT).outcome is Outcome.ACCEPTED
+    assert ask(near, np.array([24.0, 0.0]), SURE, street, DEFAULT).outcome is Outcome.UNDECIDED
+
+
+def test_after_a_silence_all_that_was_seen_in_it_counts() -> None:
+    """One building in the latest four frames says nothing; those before them do."""
+    sparse = [
+        replace(seen, centroids_m=seen.centroids_m[: 6 if at < STEPS - 4 else 0])
+        for at, seen in enumerate(frames(TOWN))
+    ]
+    arguments = predicted(1.0, 0.0), SURE, KEYFRAMES, sparse
+    assert MATCHER.follow(*arguments).opinion.outcome is Outcome.UNDECIDED
+    assert MATCHER.follow(*arguments, unanswered=STEPS).opinion.outcome is Outcome.ACCEPTED
+
+
 def _pose(keyframe: Keyframe) -> tuple[float, float, float]:
     x, y = TRUE.apply(np.array([[keyframe.x_m, keyframe.y_m]]))[0].tolist()
     return x, y, YAW + TURN

@@ -194,6 +194,36 @@ def test_a_flight_without_frames_or_poses_has_no_fix() -> None:
         assert answer.result.stamp_ns == seen_map.stamp_ns and answer.candidates
 
 
+def beyond_the_town(metres: float) -> tuple[LocalMap, list[Keyframe], list[FrameObservation], FloatArray]:
+    """The flight goes on, straight ahead in the axes of the map, over ground without a building."""
+    seen_map, poses, seen, last, _ = flight(1)
+    here, before = poses[-1], poses[-2]
+    step = np.array([here.x_m - before.x_m, here.y_m - before.y_m])
+    more = int(metres / np.hypot(*step))
+    later = [
+        replace(here, stamp_ns=here.stamp_ns + (i + 1) * SECOND, x_m=here.x_m + x, y_m=here.y_m + y)
+        for i, (x, y) in enumerate((np.arange(more)[:, None] + 1.0) * step)
+    ]
+    nothing = [FrameObservation(k.stamp_ns, np.empty((0, 2)), 105.0) for k in later]
+    path = np.array([800.0, 350.0]) / 24.0  # of a step, in the world
+    return replace(seen_map, stamp_ns=later[-1].stamp_ns), poses + later, seen + nothing, last + more * path
+
+
+def test_a_flight_that_has_left_the_match_is_carried_on_with_growing_uncertainty() -> None:
+    sigmas = []
+    for metres in (0.0, 200.0, 450.0, 600.0):
+        seen_map, poses, seen, last = flight(1)[:4] if metres == 0.0 else beyond_the_town(metres)
+        answer = Matcher(HERE, DEFAULT).fix(seen_map, poses, seen)
+        assert isinstance(answer.result, Fix), answer.result
+        error = math.hypot(answer.result.easting_m - last[0], answer.result.northing_m - last[1])
+        sigmas.append(math.sqrt(np.linalg.eigvalsh(answer.result.covariance_enu_m2[:2, :2])[-1]))
+        assert error < 3.0 * sigmas[-1] and answer.result.stamp_ns == poses[-1].stamp_ns
+    assert sigmas == sorted(sigmas) and sigmas[-1] > 450.0 * DEFAULT.drift_share > sigmas[0]
+    seen_map, poses, seen, _ = beyond_the_town(1200.0)
+    answer = Matcher(HERE, DEFAULT).fix(seen_map, poses, seen)
+    assert isinstance(answer.result, NoFix)
+
+
 # Bad maps
 
 

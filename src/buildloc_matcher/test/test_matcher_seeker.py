@@ -46,7 +46,7 @@ class Scripted:
         return Answer(fix, (), {}, agreement)
 
     def follow(
-        self, predicted: Similarity, _: FloatArray, keyframes: Sequence[Keyframe], __: object
+        self, predicted: Similarity, _: FloatArray, keyframes: Sequence[Keyframe], __: object, ___: int
     ) -> Followed:
         outcome, last = self.outcomes.popleft(), keyframes[-1]
         if outcome is not Outcome.ACCEPTED:
@@ -62,7 +62,7 @@ class Scripted:
 
 @pytest.fixture
 def matcher() -> Scripted:
-    return Scripted(check_keyframes=100, drift_share=0.02)
+    return Scripted(check_keyframes=100, drift_share=0.02, max_coast_m=300.0)
 
 
 @pytest.fixture

@@ -18,6 +18,7 @@ from buildloc_matcher.selection import (
     mnn_jaccard,
     mutual_pairs,
     observable,
+    pieces_of_one,
     score_grown,
     score_rigid,
     select,
@@ -131,6 +132,24 @@ def test_the_local_transform_holds_where_it_is_asked_for() -> None:
         assert math.degrees(here.yaw_rad) == pytest.approx(20.0 * (0.5 - along), abs=tolerance)
     ends = [np.hypot(*(score.transform.apply(BENT[[i]])[0] - SEEN.centroids_m[i])) for i in (0, -1)]
     assert max(ends) > 10.0  # what one transform makes of the same places
+
+
+def test_pieces_of_a_torn_match_are_no_rivals_and_a_shifted_one_is() -> None:
+    """Ten buildings; a match of the first seven, and others of the same map against it."""
+    points = np.array([[30.0 * i, 0.0] for i in range(10)])
+    transform = Similarity((0.0, 0.0), (0.0, 0.0), 0.0)
+
+    def match(rows: list[int], places: list[int], away_m: float) -> Score:
+        pairs = np.column_stack([rows, places])
+        return Score(transform, points + [0.0, away_m], pairs, 1.0, 0.5, 50.0)
+
+    first = match([*range(7)], [*range(7)], 0.0)
+    assert pieces_of_one(first, match([7, 8, 9], [7, 8, 9], 40.0))
+    # Two of its five buildings are others of the reference: torn at the seam. Three of five: another place.
+    assert pieces_of_one(first, match([5, 6, 7, 8, 9], [15, 6, 7, 8, 9], 40.0))
+    assert not pieces_of_one(first, match([4, 5, 6, 8, 9], [14, 15, 16, 8, 9], 40.0))
+    assert not pieces_of_one(first, match([*range(6)], [*range(1, 7)], 30.0))  # one house further on
+    assert not pieces_of_one(first, match([7, 8, 9], [7, 8, 9], 101.0))
 
 
 def test_a_rigid_candidate_has_one_transform_everywhere() -> None:
