@@ -141,7 +141,7 @@ def test_pieces_of_a_torn_match_are_no_rivals_and_a_shifted_one_is() -> None:
 
     def match(rows: list[int], places: list[int], away_m: float) -> Score:
         pairs = np.column_stack([rows, places])
-        return Score(transform, points + [0.0, away_m], pairs, 1.0, 0.5, 50.0)
+        return Score(transform, points + np.array([0.0, away_m]), pairs, 1.0, 0.5, 50.0)
 
     first = match([*range(7)], [*range(7)], 0.0)
     assert pieces_of_one(first, match([7, 8, 9], [7, 8, 9], 40.0))
