@@ -9,8 +9,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -210,6 +210,16 @@ def _drain(node: ReplayNode, images: int, alive: Callable[[], None]) -> None:
         print(f"warning: the nodes left work undone: {progress}", file=sys.stderr)
 
 
+@contextmanager
+def ended_by_sigterm() -> Iterator[None]:
+    """SIGTERM leaves the block as an exception, so that processes that were started are stopped."""
+    before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def replay(bag: Path, settings: Settings | None, rate: float, folder: Path, fixes: Path) -> Replay:
     """Play a bag into the node graph and record /buildloc/fix with a process of its own.
 
@@ -222,6 +232,7 @@ def replay(bag: Path, settings: Settings | None, rate: float, folder: Path, fixe
         require_topics(reader, bag)
         recorded = {c.topic: c.msgtype for c in reader.connections if not c.topic.startswith("/buildloc/")}
     with ExitStack() as stack:
+        stack.enter_context(ended_by_sigterm())
         supervisor = None if settings is None else stack.enter_context(Supervisor(settings, folder))
         listener = subprocess.Popen(
             [sys.executable, "-m", "buildloc.fix_listener", "--out", str(fixes)],
