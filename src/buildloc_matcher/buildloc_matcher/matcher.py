@@ -143,9 +143,8 @@ class Matcher:
         outlines = None if some.outlines is None else level[:, None] + OUTLINE_UNIT_M * some.outlines
         here = Similarity((0.0, 0.0), (buildings.centroids_m[0, 0], buildings.centroids_m[0, 1]), 0.0)
         seen = FrameObservation(0, level, 100.0, outlines)
-        refine(
-            start(here, [Keyframe(0, 0.0, 0.0, 0.0)], self.config), [seen], self.database.ground, self.config
-        )
+        begun = start(here, [Keyframe(0, 0.0, 0.0, 0.0)], self.config)
+        refine(begun, [seen], self.database.ground, self.config)
 
     def locate(self, local_map: LocalMap) -> MatchResult:
         """Ranked candidates of a map; their x, y is where the mean of the map's buildings lies.
