@@ -221,7 +221,7 @@ def test_the_footprints_of_a_run_are_read_once(grounds: Grounds) -> None:
 @pytest.fixture(scope="module")
 def records(grounds: Grounds) -> pd.DataFrame:
     """Trials that the paper's preset is tried on too: flights and controls of both towns."""
-    return pd.DataFrame([run(n, grounds) for n in range(0, 330, PAPER_EVERY)])
+    return pd.DataFrame([run(n, grounds) for n in range(0, 30 * PAPER_EVERY, PAPER_EVERY)])
 
 
 def test_where_the_papers_argmax_is_wrong_ours_is_right_or_has_no_fix(records: pd.DataFrame) -> None:
