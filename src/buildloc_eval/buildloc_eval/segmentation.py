@@ -32,7 +32,8 @@ from buildloc_eval.realworld import data_folder
 from buildloc_eval.segmentation_bars import case_bars, speed_bars
 from buildloc_eval.segmentation_errors import POOLED, SegmentationErrors, measured, summary, write_errors
 from buildloc_eval.segmented import MAPPED_AREA_M2, SCORED_GSD_M, Scored, busiest, disturbed, score
-from buildloc_eval.speed import TRAINING_KEY, frame_jpeg, speed, speed_table
+from buildloc_eval.speed import frame_jpeg, speed, speed_table
+from buildloc_eval.trained_on import trained_on
 
 Progress = Callable[[str], None]
 
@@ -89,20 +90,6 @@ class Plan:
 
 
 DEFAULT = (Case("barnarp", ""),)  # the only place that never trains what is shipped
-
-
-def trained_on(network: Network) -> dict[str, Any] | None:
-    """How a network was trained, as its own file says; None when it does not. Raises EvaluationError."""
-    text = network.metadata.get(TRAINING_KEY)
-    if text is None:
-        return None
-    try:
-        training = json.loads(text)
-    except ValueError:
-        training = None
-    if not isinstance(training, dict) or not isinstance(training.get("places"), list):
-        raise EvaluationError(f"metadata {TRAINING_KEY}: {text!r} names no places; export the network again")
-    return training
 
 
 def refuse_known_ground(case: Case, training: dict[str, Any] | None) -> None:

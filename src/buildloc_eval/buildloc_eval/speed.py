@@ -5,7 +5,6 @@ A module of its own, for the process whose memory is measured to load nothing el
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Sequence
@@ -21,12 +20,12 @@ from buildloc_segmenter.network import Network
 
 from buildloc_eval.flight import FlightConfig, focal_px
 from buildloc_eval.process_memory import peak_mb
+from buildloc_eval.trained_on import trained_on
 
 SIZE = (1280, 720)
 CAMERA = FlightConfig()  # 105 m above ground
 GSD_M = CAMERA.altitude_m / focal_px(CAMERA)
 ORTHO_GSD_M = 0.16
-TRAINING_KEY = "buildloc_training"  # of the ONNX file's metadata: JSON with the places that trained it
 FRAMES = 15
 STAGES = ("decode", "resize and infer", "instances", "mask")
 
@@ -82,7 +81,7 @@ def speed(jpeg: bytes, models: Sequence[str], config: SegmenterConfig) -> dict[s
         report[name] = {
             "ms": median, "ms_total": whole, "times the first": whole / first,
             "cpu_ms": float(np.median(busy[name])), "peak_memory_mb": memory,
-            "quantised": "quantised" in json.loads(networks[name].metadata.get(TRAINING_KEY, "{}")),
+            "quantised": "quantised" in (trained_on(networks[name]) or {}),
         }  # fmt: skip
     return report
 

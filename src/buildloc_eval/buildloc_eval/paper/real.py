@@ -36,8 +36,9 @@ from buildloc_eval.paper.sources import measure, read_boston, usable
 from buildloc_eval.paper.stages import Area, Job, Say, Search, predict, side_by_side
 from buildloc_eval.paper.store import Store
 from buildloc_eval.realworld import HOLE_MARGIN_M, data_folder
-from buildloc_eval.segmentation import Case, EvaluationError, refuse_known_ground, trained_on
+from buildloc_eval.segmentation import Case, EvaluationError, refuse_known_ground
 from buildloc_eval.segmentation_errors import Outlines, SegmentationErrors
+from buildloc_eval.trained_on import trained_on
 from buildloc_eval.world import PictureWorld
 
 CODE = (
