@@ -90,9 +90,6 @@ class MatcherConfig:
     sigma_registration_m: float = param(
         1.5, "error that all buildings of the reference share, per axis, m", 0.0, 10.0
     )
-    sigma_inflation: float = param(
-        1.2, "factor on the fitted standard deviations, for matches that are wrong", 1.0, 10.0
-    )
     min_optimum_lead: float = param(
         5.0, "smallest lead of the refined pose over another one within 20 m that fits too, nats", 0.0, 1e4
     )
@@ -112,9 +109,9 @@ class MatcherConfig:
     follow_nats: float = param(
         7.0, "evidence that decides for or against a predicted place, nats; less decides nothing", 0.1, 1e3
     )
-    min_recent_lead: float = param(
-        0.15,
-        "smallest lead of a first fix over places near by, nats per building of the recent frames",
+    min_recent_nats: float = param(
+        0.5,
+        "smallest evidence of a first fix, and lead over places near by, nats per recent frames' building",
         0.0,
         1e3,
     )

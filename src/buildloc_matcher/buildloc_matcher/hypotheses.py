@@ -45,24 +45,33 @@ class Hypotheses:
 
 @njit(nogil=True, cache=True)
 def _similarities(stars, places, corners, query, centre, gate, out):  # type: ignore[no-untyped-def]
-    """Per match: x, y of the moved centre, yaw, scale, verdict KEPT, MIRRORED or OFF_SCALE."""
+    """Per match: x, y of the moved centre, yaw, scale (none of these if mirrored), verdict KEPT, MIRRORED or
+    OFF_SCALE."""
     for h in range(len(stars)):
-        q = query[corners[stars[h]]]
-        r = places[h]
-        turned = (q[1, 0] - q[0, 0]) * (q[2, 1] - q[0, 1]) - (q[1, 1] - q[0, 1]) * (q[2, 0] - q[0, 0])
-        matched = (r[1, 0] - r[0, 0]) * (r[2, 1] - r[0, 1]) - (r[1, 1] - r[0, 1]) * (r[2, 0] - r[0, 0])
+        i, j, k = corners[stars[h], 0], corners[stars[h], 1], corners[stars[h], 2]
+        x0, y0, x1, y1, x2, y2 = query[i, 0], query[i, 1], query[j, 0], query[j, 1], query[k, 0], query[k, 1]
+        u0, v0, u1, v1 = places[h, 0, 0], places[h, 0, 1], places[h, 1, 0], places[h, 1, 1]
+        u2, v2 = places[h, 2, 0], places[h, 2, 1]
+        turned = (x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0)
+        matched = (u1 - u0) * (v2 - v0) - (v1 - v0) * (u2 - u0)
+        if turned * matched <= 0.0:
+            out[h, 4] = MIRRORED
+            continue
         real, imag, ours, theirs = 0.0, 0.0, 0.0, 0.0
-        for k in range(3):
-            n = (k + 1) % 3
-            x, y, u, v = q[n, 0] - q[k, 0], q[n, 1] - q[k, 1], r[n, 0] - r[k, 0], r[n, 1] - r[k, 1]
+        for x, y, u, v in (
+            (x1 - x0, y1 - y0, u1 - u0, v1 - v0),
+            (x2 - x1, y2 - y1, u2 - u1, v2 - v1),
+            (x0 - x2, y0 - y2, u0 - u2, v0 - v2),
+        ):
             real, imag = real + x * u + y * v, imag + x * v - y * u
             ours, theirs = ours + math.sqrt(x * x + y * y), theirs + math.sqrt(u * u + v * v)
         scale, yaw = theirs / max(ours, 1e-12), math.atan2(imag, real)
-        x, y = centre[0] - q[:, 0].mean(), centre[1] - q[:, 1].mean()
+        x, y = centre[0] - (x0 + x1 + x2) / 3.0, centre[1] - (y0 + y1 + y2) / 3.0
         c, s = scale * math.cos(yaw), scale * math.sin(yaw)
-        out[h, 0], out[h, 1] = r[:, 0].mean() + c * x - s * y, r[:, 1].mean() + s * x + c * y
+        out[h, 0] = (u0 + u1 + u2) / 3.0 + c * x - s * y
+        out[h, 1] = (v0 + v1 + v2) / 3.0 + s * x + c * y
         out[h, 2], out[h, 3] = yaw, scale
-        out[h, 4] = MIRRORED if turned * matched <= 0.0 else (OFF_SCALE if abs(scale - 1.0) > gate else KEPT)
+        out[h, 4] = OFF_SCALE if abs(scale - 1.0) > gate else KEPT
 
 
 def hypothesize(

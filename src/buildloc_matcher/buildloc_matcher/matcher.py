@@ -300,10 +300,10 @@ class Matcher:
         opinion = ask(seen, offset, begun.covariance, self.database.ground, config)
         if opinion.outcome is not Outcome.ACCEPTED:
             return f"undecided: the latest frames do not agree: {opinion.reason}"
-        if opinion.lead < config.min_recent_lead * len(seen):
+        if min(opinion.nats, opinion.lead) < config.min_recent_nats * len(seen):
             # Where houses stand close, many a place lays most of them near some house.
-            loose = f"lead {opinion.lead:.1f} nats over places near by, for {len(seen)} buildings"
-            return f"undecided: the latest frames fit loosely: {loose}"
+            told = f"{opinion.nats:.1f} nats, lead {opinion.lead:.1f} over places near by"
+            return f"undecided: the latest frames fit loosely: {told}, for {len(seen)} buildings"
         figures = {
             "recent_nats": opinion.nats, "recent_lead": opinion.lead, "recent_buildings": len(seen),
             "refine_observed": refined.observed, "refine_pairs": refined.pairs,

@@ -43,6 +43,7 @@ KEPT = (10, 5, 5)  # the best after each rigid step
 SOME = 80  # observations: enough to tell one place from another
 SAME_M = 2.0  # optima nearer than this, or than three sigma, are one
 ONE_BUILDING_M = 3.0
+CROWD = 4  # neighbours that tell how close houses stand
 LATEST_PAIRS = 3  # that tell where the last keyframe is
 
 
@@ -110,7 +111,8 @@ def refine(
     rival_m = optima.rival_m(solution)
     if rival_m is not None:
         return Unrefined(f"refinement found two optima {rival_m:.1f} m apart that fit alike")
-    covariance = config.sigma_inflation**2 * solution.covariance + registration_covariance(config)
+    covariance = solution.covariance / _certainty(solution, tree, config)
+    covariance += registration_covariance(config)
     covariance += drift_covariance(_unseen_m(window, solution, config), config)
     position, yaw = solution.state.poses[-1, :2], float(wrap(solution.state.poses[-1, 2]))
     return Refined(
@@ -118,6 +120,18 @@ def refine(
         len(window.level_m), len(solution.pairs), solution.pairs.seen,
         math.sqrt(float(np.mean(np.sum(solution.residuals_m**2, axis=1)))),
     )  # fmt: skip
+
+
+def _certainty(solution: Solution, tree: cKDTree, config: MatcherConfig) -> float:
+    """The mean probability of the pairs to be of the same building: where houses stand as close as they are
+    seen badly, the nearest is often another, and residuals do not show it."""
+    places_m = tree.data[solution.pairs.buildings]
+    away_m, _ = tree.query(places_m, k=min(CROWD + 1, tree.n))
+    by_chance = CROWD / (math.pi * away_m[:, -1] ** 2)
+    variance = solution.growth**2 * (config.sigma_frame_m**2 + config.sigma_building_m**2)
+    squared = np.sum(solution.residuals_m**2, axis=1)
+    likely = np.exp(-0.5 * squared / variance) / (2.0 * math.pi * variance)
+    return float(np.mean(likely / (likely + by_chance)))
 
 
 def _unseen_m(window: Window, solution: Solution, config: MatcherConfig) -> float:

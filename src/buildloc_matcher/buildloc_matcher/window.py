@@ -294,10 +294,13 @@ class _Fit:
         information[-5:] = 1.0 / np.square([place, place, turn, scale, scale])
         return information
 
+    def _walked(self) -> FloatArray:
+        """(3 K + 2, 3 K + 2) information of the steps between keyframes."""
+        return np.asarray((self._step_jacobian.T * self._step_information) @ self._step_jacobian)
+
     def information(self, weights: FloatArray) -> FloatArray:
         """All information with these weights of the observations."""
-        walked = (self._step_jacobian.T * self._step_information) @ self._step_jacobian
-        return np.asarray(self._observed(weights) + walked + np.diag(self._prior()))
+        return np.asarray(self._observed(weights) + self._walked() + np.diag(self._prior()))
 
     def gradient(self) -> FloatArray:
         """(3 K + 2,) by which the normal equations give the step."""
@@ -313,10 +316,11 @@ class _Fit:
         """(3, 3) of the last pose, and the factor by which the variance of observations was raised for it.
 
         The asymptotic covariance of an M-estimator: curvature w^2 instead of the weights w of the steps, and
-        mean squared influence over it, per building, less the freedom that the poses take.
+        mean squared influence over it, per building, less the freedom that the poses take. Where observations
+        err more than modelled, so may the steps of the path: their variance grows with the other's root.
         """
         observed = self._observed(self.weights**2)
-        rest = self.information(np.zeros_like(self.weights))
+        rest = self._walked() / self._growth + np.diag(self._prior())
         weights2 = self._means(self.weights) ** 2
         taken = float(np.trace(np.linalg.solve(observed + rest, observed)))
         told = self._means(np.trace(self._certainty, axis1=1, axis2=2))

@@ -140,7 +140,7 @@ def test_two_optima_are_refused() -> None:
 def normalised_squares(seed: int) -> FloatArray:
     """Of the errors over x, y and yaw of refined poses, by their covariance: 60 short flights."""
     rng = np.random.default_rng(seed)
-    shared, config = 1.0, replace(DEFAULT, sigma_registration_m=0.0, sigma_inflation=1.0)
+    shared, config = 1.0, replace(DEFAULT, sigma_registration_m=0.0)
     squares = []
     for _ in range(60):
         world = CITY + rng.normal(0.0, shared, CITY.shape)

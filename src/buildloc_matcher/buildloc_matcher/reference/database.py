@@ -100,6 +100,9 @@ class ReferenceDatabase:
 
     def star_corners(self, stars: NDArray[np.int64]) -> FloatArray:
         """(M, 3, 2) centroids at the corners of the stars' central triangles, by their sorted angles."""
+        if len(self.tiles) == 1:
+            tile = self.tiles[0]
+            return np.asarray(tile.buildings.centroids_m[tile.triangles.vertices[stars]])
         corners = np.empty((len(stars), 3, 2))
         of_tile = np.searchsorted([table.first for table in self.tables], stars, side="right") - 1
         for number, (tile, table) in enumerate(zip(self.tiles, self.tables, strict=True)):
