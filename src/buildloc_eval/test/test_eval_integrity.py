@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -40,6 +41,7 @@ from buildloc_eval.integrity.trials import attempt, other_city, run
 from buildloc_eval.paper.store import StaleError
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.reference.buildings import Buildings, concatenate
+from buildloc_matcher.reference.database import MANIFEST, DatabaseError
 from buildloc_matcher.reference.region import WGS84, Circle, transformer
 from buildloc_msgs_py.errors import BuildlocError
 from pyproj import CRS
@@ -216,6 +218,15 @@ def test_the_footprints_of_a_run_are_read_once(grounds: Grounds) -> None:
         raise AssertionError(name)
 
     Grounds(Path(grounds.folder), TINY, 1, MatcherConfig()).build(never, lambda _: None)
+
+
+def test_references_of_another_format_are_refused(grounds: Grounds, tmp_path: Path) -> None:
+    kept = Grounds(shutil.copytree(grounds.folder, tmp_path / "grounds"), TINY, 1, MatcherConfig())
+    assert len(kept.reference(PLACES[0], KM, "as is")) > 100
+    for manifest in kept.folder.glob(f"*/{MANIFEST}"):
+        manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"version": 2}))
+    with pytest.raises(DatabaseError, match="has version 2, not 3"):
+        kept.reference(PLACES[1], KM, "as is")
 
 
 @pytest.fixture(scope="module")
