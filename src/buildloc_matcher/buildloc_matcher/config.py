@@ -84,9 +84,12 @@ class MatcherConfig:
         0.6, "least error of it that all frames share, the reference's own included, per axis, m", 0.05, 10.0
     )
     walk_m: float = param(
-        0.05, "error of the mapper from keyframe to keyframe, per axis, m per root of a metre", 0.001, 5.0
+        0.03,
+        "least error of the mapper from keyframe to keyframe, per axis, m per root of a metre",
+        0.001,
+        5.0,
     )
-    walk_deg: float = param(0.05, "the same of its heading, deg per root of a metre", 0.001, 10.0)
+    walk_deg: float = param(0.03, "the same of its heading, deg per root of a metre", 0.001, 10.0)
     sigma_registration_m: float = param(
         1.5, "error that all buildings of the reference share, per axis, m", 0.0, 10.0
     )

@@ -192,7 +192,7 @@ def solve(window: Window, state: State, pairing: Pairing, config: MatcherConfig)
 
     An observation of a building that is seen n times has the variance sigma_frame^2 + n sigma_building^2, so
     that all n together weigh what one of them without its own noise does. Errors that turn out larger than
-    these widen the covariance, smaller ones do not narrow it.
+    these widen the covariance, and the errors of the path by as much; smaller ones do not narrow it.
     """
     first, growth = state, 1.0
     for _ in range(ROUNDS):
@@ -253,7 +253,7 @@ class _Fit:
         jacobian[:, :2, -1] = -arms
         length = np.maximum(np.hypot(*window.steps[:, :2].T), SHORTEST_STEP_M)
         sigmas = np.array([self._config.walk_m, self._config.walk_m, math.radians(self._config.walk_deg)])
-        information = 1.0 / (length[:, None] * sigmas**2)
+        information = 1.0 / (length[:, None] * (self._growth * sigmas) ** 2)
         return residuals.ravel(), jacobian.reshape(-1, 3 * count + 2), information.ravel()
 
     def _means(self, values: FloatArray) -> FloatArray:
@@ -316,11 +316,10 @@ class _Fit:
         """(3, 3) of the last pose, and the factor by which the variance of observations was raised for it.
 
         The asymptotic covariance of an M-estimator: curvature w^2 instead of the weights w of the steps, and
-        mean squared influence over it, per building, less the freedom that the poses take. Where observations
-        err more than modelled, so may the steps of the path: their variance grows with the other's root.
+        mean squared influence over it, per building, less the freedom that the poses take.
         """
         observed = self._observed(self.weights**2)
-        rest = self._walked() / self._growth + np.diag(self._prior())
+        rest = self._walked() + np.diag(self._prior())
         weights2 = self._means(self.weights) ** 2
         taken = float(np.trace(np.linalg.solve(observed + rest, observed)))
         told = self._means(np.trace(self._certainty, axis1=1, axis2=2))

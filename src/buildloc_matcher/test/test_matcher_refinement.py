@@ -140,8 +140,8 @@ def test_two_optima_are_refused() -> None:
 def normalised_squares(seed: int) -> FloatArray:
     """Of the errors over x, y and yaw of refined poses, by their covariance: 60 short flights."""
     rng = np.random.default_rng(seed)
-    shared, config = 1.0, replace(DEFAULT, sigma_registration_m=0.0)
-    squares = []
+    config = replace(DEFAULT, sigma_registration_m=0.0, walk_m=0.05, walk_deg=0.05)
+    shared, squares = 1.0, []
     for _ in range(60):
         world = CITY + rng.normal(0.0, shared, CITY.shape)
         first, step = rng.uniform(250.0, 600.0, 2), rng.uniform(-15.0, 15.0, 2)
