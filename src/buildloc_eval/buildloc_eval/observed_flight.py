@@ -14,7 +14,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.reference.buildings import Buildings
+from buildloc_matcher.window import frames_kept
 from buildloc_msgs_py.types import FloatArray, FrameObservation, Keyframe, LocalMap
 from scipy.spatial import cKDTree
 
@@ -36,7 +38,6 @@ from buildloc_eval.segmentation_errors import read_errors
 
 KEYFRAME_STEPS = 5  # 25 m
 HALF_FRAME_M = 40.0  # along the path
-FRAMES = 80  # the latest, that a matcher keeps
 KEYFRAME_PERIOD_NS = 5_000_000_000
 ALTITUDE_M = 100.0
 
@@ -148,7 +149,7 @@ def _observed(
         Keyframe(int(stamp), float(x), float(y), float(yaw))
         for stamp, (x, y), yaw in zip(stamps, places, yaws, strict=True)
     )
-    latest = range(max(0, len(steps) - FRAMES), len(steps))
+    latest = range(max(0, len(steps) - frames_kept(MatcherConfig())), len(steps))
     observations = tuple(
         FrameObservation(int(stamps[k]), levels[frame == k], scale * ALTITUDE_M) for k in latest
     )

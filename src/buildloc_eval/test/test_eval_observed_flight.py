@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from buildloc_eval.observation import Digitiser, ObservationError, Sensing, sensing
 from buildloc_eval.observed_flight import (
-    FRAMES,
     Flown,
     FrameErrors,
     ObservedFlight,
@@ -19,8 +18,10 @@ from buildloc_eval.observed_flight import (
     observe_flight,
     scaled,
 )
+from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.geometry import Similarity, rotation
 from buildloc_matcher.reference.buildings import Buildings
+from buildloc_matcher.window import frames_kept
 from buildloc_msgs_py.types import FloatArray
 
 SAME = Digitiser(0.0, 0.0, 1e-9, 0.0, 0.0, (0.0, 0.0, 0.0, 0.0))
@@ -69,7 +70,7 @@ def test_the_true_pose_of_the_last_keyframe_puts_an_errorless_map_on_its_buildin
     assert seen.max() < 1e-6
     last = flight.observations[-1]
     assert last.stamp_ns == flight.keyframes[-1].stamp_ns == flight.local_map.stamp_ns
-    assert len(flight.observations) == min(FRAMES, len(flight.keyframes))
+    assert len(flight.observations) == min(frames_kept(MatcherConfig()), len(flight.keyframes))
     assert np.hypot(*last.centroids_m.T).max() < math.hypot(70.0, 45.0)  # a swath's half, a frame's half
     places = np.array([(k.x_m, k.y_m) for k in flight.keyframes])
     steps = np.hypot(*np.diff(places, axis=0).T)

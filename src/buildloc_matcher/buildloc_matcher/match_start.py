@@ -17,7 +17,7 @@ from buildloc_matcher.evidence import Ground, QueryMap
 from buildloc_matcher.selection import Score, beyond_m, local_transform
 from buildloc_matcher.window import Start, State, newest, start
 
-START_M, START_DEG = 2.5, 1.5  # error of a grown match where its buildings are
+START_M, START_DEG = 5.0, 1.5  # error of a grown match where its buildings are
 MATCHED_M = 150.0  # with some matched buildings so near, a keyframe's place is told by the match
 TRIES = 4  # pieces of the flight, from the newest back, that may agree with the reference
 
@@ -54,6 +54,8 @@ def ends(score: Score, query: QueryMap, path: Sequence[Keyframe], config: Matche
     away_m = np.array([beyond_m(score, np.array([k.x_m, k.y_m]), query) for k in path])
     near = np.flatnonzero(away_m <= max(MATCHED_M, away_m.min())) + 1
     found = [len(path)]
-    while len(found) < TRIES and (before := near[near <= found[-1] - config.refine_frames // 2]).size:
+    least = max(1, config.refine_frames // 2)  # keyframes of a piece, and from one to the next
+    near = near[near >= least]
+    while len(found) < TRIES and (before := near[near <= found[-1] - least]).size:
         found.append(int(before[-1]))
     return found

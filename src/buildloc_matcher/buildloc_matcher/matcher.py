@@ -22,7 +22,7 @@ from buildloc_matcher.acceptance import (
 )
 from buildloc_matcher.config import MatcherConfig, check_matcher
 from buildloc_matcher.evidence import QueryMap, query_map, seed_evidence
-from buildloc_matcher.follow import Opinion, ask, seen_in_world
+from buildloc_matcher.follow import SIGMAS, Opinion, ask, seen_in_world
 from buildloc_matcher.geometry import Similarity, wrap
 from buildloc_matcher.hypotheses import hypothesize
 from buildloc_matcher.local_map import check_map
@@ -38,11 +38,19 @@ from buildloc_matcher.pursuit import (
     agree,
     carry,
     prediction,
+    sigma_m,
     sigmas_apart,
 )
 from buildloc_matcher.reference.buildings import OUTLINE_UNIT_M
 from buildloc_matcher.reference.database import DatabaseError, ReferenceDatabase, descriptor_hash
-from buildloc_matcher.refinement import Refined, Unrefined, covariance_enu, refine, registration_covariance
+from buildloc_matcher.refinement import (
+    MOST_RIVAL_M,
+    Refined,
+    Unrefined,
+    covariance_enu,
+    refine,
+    registration_covariance,
+)
 from buildloc_matcher.selection import Score, local_transform, pieces_of_one, select
 from buildloc_matcher.voting import Cluster, vote
 from buildloc_matcher.window import frames_kept, newest, start
@@ -84,6 +92,22 @@ class Followed:
 
     opinion: Opinion
     agreement: Agreement | None
+
+
+@dataclass(frozen=True)
+class _Refusal:
+    """Why a piece of the flight gave no place, and whether the reference spoke against it."""
+
+    reason: str
+    contradicted: bool = False
+
+
+@dataclass(frozen=True)
+class _Caught:
+    """The place of a flight's last keyframe, and the latest agreement on the way there."""
+
+    place: Place
+    agreement: Agreement
 
 
 @dataclass(frozen=True)
@@ -206,7 +230,7 @@ class Matcher:
         }
         scores = tuple(found for _, found in selected)
         others = zip(candidates[1:], scores[1:], strict=True)
-        rivals = tuple(one for one, found in others if not pieces_of_one(scores[0], found))
+        rivals = tuple(one for one, found in others if not pieces_of_one(scores[0], found, query, config))
         if candidates:
             funnel["lead"] = lead(candidates[0], rivals, config)
             funnel["log_odds"] = candidates[0].acceptance
@@ -265,50 +289,56 @@ class Matcher:
         path, reasons = newest(keyframes, frames_kept(self.config)), list[str]()
         assert found.query is not None
         for end in ends(found.scores[0], found.query, path, self.config):
-            agreed = self._agree(found, path[:end], observations)
-            if isinstance(agreed, str):
-                reasons.append(agreed)
+            agreed, figures = self._agree(found, path[:end], observations)
+            funnel |= {} if reasons else figures
+            if isinstance(agreed, _Refusal):
+                reasons.append(agreed.reason)
                 continue
-            agreement, figures = agreed
-            caught = self._catch_up(agreement, end, path, observations)
-            if isinstance(caught, str):
-                reasons.append(caught)
+            caught = self._catch_up(agreed, end, path, observations)
+            if isinstance(caught, _Refusal):
+                reasons.append(caught.reason)
+                if caught.contradicted:
+                    break
                 continue
-            last, (place, agreement) = path[-1], caught
             funnel |= figures | {"refine_tries": len(reasons) + 1.0}
-            altitude = next((o.altitude_m for o in observations if o.stamp_ns == last.stamp_ns), float("nan"))
-            return Answer(self.fix_at(place, altitude), found.candidates, funnel, agreement)
-        return none(reasons[0])
+            last = path[-1].stamp_ns
+            altitude = next((o.altitude_m for o in observations if o.stamp_ns == last), float("nan"))
+            return Answer(self.fix_at(caught.place, altitude), found.candidates, funnel, caught.agreement)
+        return none("; earlier in the flight: ".join(dict.fromkeys((reasons[0], reasons[-1]))))
 
     def _agree(
         self, found: MatchResult, path: Sequence[Keyframe], observations: Sequence[FrameObservation]
-    ) -> tuple[Agreement, dict[str, float]] | str:
-        """What the reference agrees to at the end of a path, by the best candidate, and figures of it; or
-        why it does not."""
+    ) -> tuple[Agreement | _Refusal, dict[str, float]]:
+        """What the reference agrees to at the end of a path, by the best candidate, or why it does not; and
+        the figures behind it."""
         config = self.config
         assert found.query is not None
         begun = start_of(found.scores[0], found.query, path, self.database.ground, config)
+        if SIGMAS * begun.sigma_m > MOST_RIVAL_M:
+            far = f"the flight has left the matched buildings, its place is open by {begun.sigma_m:.0f} m"
+            return _Refusal(f"undecided: {far}"), {}
         refined = refine(begun, observations, self.database.ground, config)
         if isinstance(refined, Unrefined):
-            return refined.reason
+            return _Refusal(refined.reason), {}
+        figures: dict[str, float] = {
+            "refine_observed": refined.observed, "refine_pairs": refined.pairs,
+            "refine_buildings": refined.buildings, "refine_rms_m": refined.rms_m,
+        }  # fmt: skip
         refused = refuse_refined(refined, config)
         if refused is not None:
-            return refused
+            return _Refusal(refused), figures
         poses = _refined(refined)
         seen = seen_in_world(poses, observations, len(begun.keyframes))
         offset = refined.position_m - begun.state.poses[-1, :2]
         opinion = ask(seen, offset, begun.covariance, self.database.ground, config)
+        figures |= {"recent_nats": opinion.nats, "recent_lead": opinion.lead, "recent_buildings": len(seen)}
         if opinion.outcome is not Outcome.ACCEPTED:
-            return f"undecided: the latest frames do not agree: {opinion.reason}"
+            return _Refusal(f"undecided: the latest frames do not agree: {opinion.reason}"), figures
         if min(opinion.nats, opinion.lead) < config.min_recent_nats * len(seen):
             # Where houses stand close, many a place lays most of them near some house.
             told = f"{opinion.nats:.1f} nats, lead {opinion.lead:.1f} over places near by"
-            return f"undecided: the latest frames fit loosely: {told}, for {len(seen)} buildings"
-        figures = {
-            "recent_nats": opinion.nats, "recent_lead": opinion.lead, "recent_buildings": len(seen),
-            "refine_observed": refined.observed, "refine_pairs": refined.pairs,
-            "refine_buildings": refined.buildings, "refine_rms_m": refined.rms_m,
-        }  # fmt: skip
+            loose = f"undecided: the latest frames fit loosely: {told}, for {len(seen)} buildings"
+            return _Refusal(loose), figures
         return Agreement(poses, refined.covariance, math.exp(begun.state.log_scales[1])), figures
 
     def _catch_up(
@@ -317,7 +347,7 @@ class Matcher:
         known: int,
         path: Sequence[Keyframe],
         observations: Sequence[FrameObservation],
-    ) -> tuple[Place, Agreement] | str:
+    ) -> _Caught | _Refusal:
         """From an agreement about the first ``known`` keyframes of a path to the place of its last one, by
         following the flight in between; or why that is not known."""
         config = self.config
@@ -326,19 +356,20 @@ class Matcher:
             known = min(known + config.follow_frames, len(path))
             pursuit = carry(pursuit, path[:known], config)
             if pursuit.mode is Mode.ACQUIRE:
-                return f"the match ends before the flight: {pursuit.withdrawn}"
+                return _Refusal(f"the match ends before the flight: {pursuit.withdrawn}")
             anchor, last = pursuit.anchors[path[known - 1].stamp_ns], path[known - 1]
             predicted, uncertainty = prediction(anchor, last), anchor.uncertainty(config)
-            followed = self.follow(predicted, uncertainty, path[:known], observations, pursuit.unanswered)
+            unanswered = pursuit.unanswered(last.stamp_ns)
+            followed = self.follow(predicted, uncertainty, path[:known], observations, unanswered)
             if followed.opinion.outcome is Outcome.REJECTED:
-                return f"the match ends before the flight: {followed.opinion.reason}"
+                return _Refusal(f"the match ends before the flight: {followed.opinion.reason}", True)
             if followed.agreement is not None:
                 agreement = followed.agreement
                 pursuit = agree(pursuit, agreement, config)
         last = path[-1]
         anchor = pursuit.anchors[last.stamp_ns]
         place = Place(last.stamp_ns, anchor.x_m, anchor.y_m, anchor.yaw_rad, anchor.uncertainty(config))
-        return place, agreement
+        return _Caught(place, agreement)
 
     def fix_at(self, place: Place, altitude_m: float) -> Fix:
         """The fix of a camera at a place."""
@@ -362,11 +393,14 @@ class Matcher:
         so many keyframes without an agreement."""
         config, reference = self.config, self.database.ground
         last = max(keyframes, key=lambda k: k.stamp_ns)
-        refined = refine(start(predicted, keyframes, config), observations, reference, config)
+        begun = start(predicted, keyframes, config, sigma_m(covariance))
+        refined = refine(begun, observations, reference, config)
         poses = _refined(refined) if isinstance(refined, Refined) else _placed(predicted, keyframes)
         offset = np.array(poses[last.stamp_ns]) - np.array(_placed(predicted, [last])[last.stamp_ns])
         offset[2] = wrap(offset[2])
-        frames = min(max(config.follow_frames, unanswered), config.refine_frames)
+        frames = config.follow_frames
+        if isinstance(refined, Refined):  # else older frames lie where no fit has bent the path to
+            frames = min(max(frames, unanswered), config.refine_frames)
         seen = seen_in_world(poses, observations, frames)
         opinion = ask(seen, offset[:2], covariance, reference, config)
         if opinion.outcome is not Outcome.ACCEPTED:

@@ -105,10 +105,9 @@ class Pursuit:
         """Distance from the last agreement to the newest keyframe, NaN while acquiring."""
         return self.anchors[max(self.anchors)].flown_m if self.anchors else math.nan
 
-    @property
-    def unanswered(self) -> int:
-        """Keyframes since the last agreement."""
-        return sum(anchor.flown_m > 0.0 for anchor in self.anchors.values())
+    def unanswered(self, stamp_ns: int) -> int:
+        """Keyframes since the last agreement, up to one of this stamp."""
+        return sum(anchor.flown_m > 0.0 and at <= stamp_ns for at, anchor in self.anchors.items())
 
 
 def withdraw(pursuit: Pursuit, reason: str) -> Pursuit:

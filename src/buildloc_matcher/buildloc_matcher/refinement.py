@@ -35,7 +35,7 @@ from buildloc_matcher.window import (
 )
 
 # Another optimum is sought within three sigma of the start, at least and at most so far.
-RIVAL_M, MOST_RIVAL_M = 25.0, 60.0
+RIVAL_M, MOST_RIVAL_M = 25.0, 90.0
 RIVAL_CELL_M = 3.0
 RIVAL_TURN_RAD = math.radians(4.0)
 RIVALS = 8  # shifts tried
@@ -44,7 +44,7 @@ SOME = 80  # observations: enough to tell one place from another
 SAME_M = 2.0  # optima nearer than this, or than three sigma, are one
 ONE_BUILDING_M = 3.0
 CROWD = 4  # neighbours that tell how close houses stand
-LATEST_PAIRS = 3  # that tell where the last keyframe is
+LATEST_BUILDINGS = 3  # that tell where the last keyframe is
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def _certainty(solution: Solution, tree: cKDTree, config: MatcherConfig) -> floa
     seen badly, the nearest is often another, and residuals do not show it."""
     places_m = tree.data[solution.pairs.buildings]
     away_m, _ = tree.query(places_m, k=min(CROWD + 1, tree.n))
-    by_chance = CROWD / (math.pi * away_m[:, -1] ** 2)
+    by_chance = CROWD / (math.pi * np.maximum(away_m[:, -1], 1.0) ** 2)
     variance = solution.growth**2 * (config.sigma_frame_m**2 + config.sigma_building_m**2)
     squared = np.sum(solution.residuals_m**2, axis=1)
     likely = np.exp(-0.5 * squared / variance) / (2.0 * math.pi * variance)
@@ -135,11 +135,13 @@ def _certainty(solution: Solution, tree: cKDTree, config: MatcherConfig) -> floa
 
 
 def _unseen_m(window: Window, solution: Solution, config: MatcherConfig) -> float:
-    """How far the last keyframe is along the path from the latest buildings that were found."""
+    """How far the last keyframe is along the path from the third-latest building that was found."""
     sigma_m = solution.growth * math.hypot(config.sigma_frame_m, config.sigma_building_m)
     near = np.hypot(*solution.residuals_m.T) < GATE_SIGMAS * sigma_m
-    frames = np.sort(window.frames[solution.pairs.rows[near]])
-    latest = frames[-min(LATEST_PAIRS, len(frames))] if len(frames) else 0
+    frames, buildings = window.frames[solution.pairs.rows[near]], solution.pairs.buildings[near]
+    _, last = np.unique(buildings[::-1], return_index=True)  # of each building the latest frame
+    seen = np.sort(frames[::-1][last])
+    latest = seen[-min(LATEST_BUILDINGS, len(seen))] if len(seen) else 0
     return float(np.hypot(*window.steps[latest:, :2].T).sum())
 
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from buildloc_msgs_py.types import Fix, FrameObservation, Keyframe, LocalMap, NoFix, Tracked
+from buildloc_msgs_py.types import Fix, FloatArray, FrameObservation, Keyframe, LocalMap, NoFix, Tracked
 
 from buildloc_matcher.acceptance import Outcome
 from buildloc_matcher.geometry import wrap
@@ -103,7 +103,9 @@ class Seeker:
         if last is None or anchor is None:
             answer, step = self._acquire(local_map, keyframes, observations)
         else:
-            answer, step = self._follow(anchor, pursuit.unanswered, last, local_map, keyframes, observations)
+            answer, step = self._follow(
+                anchor, pursuit.unanswered(last.stamp_ns), last, local_map, keyframes, observations
+            )
         with self._lock:
             if flight is not self._flight:
                 return Answer(NoFix(local_map.stamp_ns, "the flight was forgotten meanwhile"), (), {})
@@ -170,7 +172,7 @@ class Seeker:
         offset = np.array([fix.easting_m - anchor.x_m, fix.northing_m - anchor.y_m, 0.0])
         offset[2] = wrap(fix.yaw_rad - anchor.yaw_rad)
         apart = sigmas_apart(
-            offset, anchor.uncertainty(config), found.agreement.covariance, registration_covariance(config)
+            offset, anchor.uncertainty(config), _covariance(fix), registration_covariance(config)
         )
         if apart <= config.max_jump_sigmas:
             return None
@@ -183,3 +185,10 @@ class Seeker:
             self.withdrawals += 1
             self.reason = pursuit.withdrawn
         self.pursuit = pursuit
+
+
+def _covariance(fix: Fix) -> FloatArray:
+    """(3, 3) over east, north and yaw."""
+    covariance = np.diag([0.0, 0.0, fix.yaw_variance_rad2])
+    covariance[:2, :2] = fix.covariance_enu_m2[:2, :2]
+    return covariance

@@ -21,7 +21,7 @@ from buildloc_matcher.evidence import (
     placed_evidence,
     scale_evidence,
 )
-from buildloc_matcher.geometry import Similarity, fit_similarity
+from buildloc_matcher.geometry import Similarity, fit_similarity, wrap
 from buildloc_matcher.growth import Grown, grow
 from buildloc_matcher.hypotheses import Hypotheses
 from buildloc_matcher.point_grid import near, nearest
@@ -31,7 +31,8 @@ GROWN_SCORED = 10  # distinct grown matches that get the full score
 NEGLIGIBLE_NATS = 60.0  # a match that much less likely than the best is not listed
 LOCAL_M = 100.0  # pairs around a place that tell how the map lies there, and how many it takes
 LOCAL_PAIRS = 6
-TORN_M, CONTRADICTIONS = 100.0, 0.4  # how far the pieces of a match lie apart, and how often they disagree
+# How far the pieces of a match lie apart, how near they meet, and the share of a piece that lies at the seam.
+TORN_M, NEIGHBOUR_M, CONTRADICTED = 100.0, 40.0, 0.5
 SHIFT_M = 100.0  # how far a match is moved to see whether it fits as well there
 
 
@@ -207,14 +208,20 @@ def shifted(places_m: FloatArray, reference: Ground, config: MatcherConfig) -> F
     return np.array(found).reshape(-1, 3, 2)
 
 
-def pieces_of_one(one: Score, other: Score) -> bool:
-    """Whether two matches are pieces of one that the map's bend has torn: they lie near each other, and
-    seldom match a building of the map with different ones of the reference."""
-    if _apart(one, other) > TORN_M:
+def pieces_of_one(one: Score, other: Score, query: QueryMap, config: MatcherConfig) -> bool:
+    """Whether two matches are pieces of one that the map's bend has torn: they lie near each other, turned
+    alike, and match different parts of the map. Where both match some buildings of the same neighbourhood,
+    and put it in two places, they contradict each other."""
+    turn = abs(float(wrap(one.transform.yaw_rad - other.transform.yaw_rad)))
+    if _apart(one, other) > TORN_M or turn > math.radians(2.0 * config.rotation_tolerance_deg):
         return False
-    _, ours, theirs = np.intersect1d(one.pairs[:, 0], other.pairs[:, 0], return_indices=True)
-    contradictions = np.count_nonzero(one.pairs[ours, 1] != other.pairs[theirs, 1])
-    return bool(contradictions < CONTRADICTIONS * min(len(one.pairs), len(other.pairs)))
+    if not len(one.pairs) or not len(other.pairs):
+        return False
+    matched = other.pairs[:, 0]
+    away_m, _ = cKDTree(query.points_m[one.pairs[:, 0]]).query(query.points_m[matched])
+    moved_m = np.linalg.norm(one.moved_m[matched] - other.moved_m[matched], axis=1)
+    contradicted = (away_m < NEIGHBOUR_M) & (moved_m > config.mnn_distance_m)
+    return bool(np.mean(contradicted) < CONTRADICTED)
 
 
 def _start(cluster: Cluster, query: QueryMap) -> Similarity:

@@ -128,14 +128,17 @@ class Start:
         return np.diag(np.square([self.sigma_m, self.sigma_m, self.sigma_rad]))
 
 
-def start(coarse: Similarity, keyframes: Sequence[Keyframe], config: MatcherConfig) -> Start:
+def start(
+    coarse: Similarity, keyframes: Sequence[Keyframe], config: MatcherConfig, sigma_m: float = 0.0
+) -> Start:
     """The last ``refine_frames`` keyframes where a similarity map -> world puts them; what frames saw keeps
-    the altimeter's scale. Buildings are sought within three sigma."""
+    the altimeter's scale. ``sigma_m`` is the least that the place is taken to be uncertain by."""
     last = newest(keyframes, config.refine_frames)
     poses = np.array([[k.x_m, k.y_m, k.yaw_rad] for k in last]).reshape(-1, 3)
     placed = np.column_stack([coarse.apply(poses[:, :2]), poses[:, 2] + coarse.yaw_rad])
     state = State(placed, np.array([0.0, math.log(coarse.scale)]))
-    return Start(last, state, config.refine_distance_m / 3.0, math.radians(config.rotation_tolerance_deg))
+    sigma_m = max(sigma_m, config.refine_distance_m / 3.0)
+    return Start(last, state, sigma_m, math.radians(config.rotation_tolerance_deg))
 
 
 def frames_kept(config: MatcherConfig) -> int:

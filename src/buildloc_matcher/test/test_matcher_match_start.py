@@ -26,9 +26,9 @@ SCORE = Score(AWAY, AWAY.apply(STREET), np.column_stack([MATCHED, MATCHED]), 0.0
 def test_a_flight_is_tried_whole_then_where_the_match_ends_then_further_back() -> None:
     # Six matched houses within 150 m: up to the keyframe at 1,000 m (the sixth-nearest house is at 850 m).
     assert ends(SCORE, mapped(STREET), PATH, DEFAULT) == [80, 40, 30, 20]
-    assert ends(SCORE, mapped(STREET), PATH[:35], DEFAULT) == [35, 25, 15, 5]
-    # Far beyond the match the keyframe that is nearest to it counts.
-    assert ends(SCORE, mapped(STREET), PATH[60:], DEFAULT) == [20, 1]
+    assert ends(SCORE, mapped(STREET), PATH[:35], DEFAULT) == [35, 25, 15]  # no piece of fewer than ten
+    # Far beyond the match there is no such place.
+    assert ends(SCORE, mapped(STREET), PATH[60:], DEFAULT) == [20]
     assert ends(SCORE, mapped(STREET), PATH, matcher_config({"preset": "paper"})) == [80]
 
 

@@ -90,7 +90,9 @@ def test_uncertainty_grows_with_the_distance_since_the_agreement_and_shrinks_wit
     pursuit = acquired(PATH)
     sigmas = [sigma_m(pursuit.anchors[k.stamp_ns].uncertainty(CONFIG)) for k in PATH[1:]]
     assert sigmas == sorted(sigmas) and sigmas[0] == pytest.approx(2.0)
-    assert pursuit.unanswered == len(PATH) - 2 and acquired(PATH[:2]).unanswered == 0
+    assert (
+        pursuit.unanswered(PATH[-1].stamp_ns) == len(PATH) - 2 and pursuit.unanswered(PATH[1].stamp_ns) == 0
+    )
     # 153 m north: 2 % of it drift, and the heading's degree across it.
     far = pursuit.anchors[4 * SECOND].uncertainty(CONFIG)
     assert far[1, 1] == pytest.approx(1.0 + (0.02 * 153.0) ** 2)

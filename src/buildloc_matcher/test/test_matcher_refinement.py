@@ -231,3 +231,17 @@ def test_a_mirror_image_is_fitted_by_a_turn() -> None:
     points = CITY[:20]
     turn = rotation(fit_rigid(points, points * [-1.0, 1.0]).yaw_rad)
     assert np.linalg.det(turn) == pytest.approx(1.0)
+
+
+def test_where_houses_stand_as_close_as_they_are_seen_badly_a_residual_says_less() -> None:
+    """The same flight and the same errors over the town, and over one whose houses have neighbours as close
+    as their centroids err: the nearest is often another, and residuals look small."""
+    rng = np.random.default_rng(3)
+    seen = [replace(s, centroids_m=s.centroids_m + rng.normal(0.0, 1.5, s.centroids_m.shape)) for s in SEEN]
+    beside = np.concatenate([CITY + by for by in ([0.0, 0.0], [4.0, 1.0], [-1.0, 4.0], [2.0, -4.0])])
+    config, begun = replace(DEFAULT, sigma_registration_m=0.0), coarse(0.5, 0.5, 0.1)
+    alone = refined_of(refine(start(begun, POSES, config), seen, GROUND, config))
+    crowded = refined_of(refine(start(begun, POSES, config), seen, alike(beside), config))
+    assert crowded.rms_m < 0.9 * alone.rms_m
+    sigmas = [math.sqrt(float(np.trace(one.covariance[:2, :2]))) / one.rms_m for one in (alone, crowded)]
+    assert sigmas[1] > 1.05 * sigmas[0]

@@ -57,7 +57,10 @@ class Scripted:
 
     def fix_at(self, place: Place, altitude_m: float) -> Fix:
         spread = np.diag([*np.diag(place.covariance)[:2], 1.0])
-        return Fix(place.stamp_ns, 0.0, 0.0, altitude_m, place.x_m, place.y_m, place.yaw_rad, spread)
+        variance = float(place.covariance[2, 2])
+        return Fix(
+            place.stamp_ns, 0.0, 0.0, altitude_m, place.x_m, place.y_m, place.yaw_rad, spread, variance
+        )
 
 
 @pytest.fixture

@@ -137,19 +137,25 @@ def test_the_local_transform_holds_where_it_is_asked_for() -> None:
 def test_pieces_of_a_torn_match_are_no_rivals_and_a_shifted_one_is() -> None:
     """Ten buildings; a match of the first seven, and others of the same map against it."""
     points = np.array([[30.0 * i, 0.0] for i in range(10)])
+    row = mapped(points)
     transform = Similarity((0.0, 0.0), (0.0, 0.0), 0.0)
 
     def match(rows: list[int], places: list[int], away_m: float) -> Score:
         pairs = np.column_stack([rows, places])
         return Score(transform, points + np.array([0.0, away_m]), pairs, 1.0, 0.5, 50.0)
 
+    def pieces(other: Score) -> bool:
+        return pieces_of_one(first, other, row, DEFAULT)
+
     first = match([*range(7)], [*range(7)], 0.0)
-    assert pieces_of_one(first, match([7, 8, 9], [7, 8, 9], 40.0))
-    # Two of its five buildings are others of the reference: torn at the seam. Three of five: another place.
-    assert pieces_of_one(first, match([5, 6, 7, 8, 9], [15, 6, 7, 8, 9], 40.0))
-    assert not pieces_of_one(first, match([4, 5, 6, 8, 9], [14, 15, 16, 8, 9], 40.0))
-    assert not pieces_of_one(first, match([*range(6)], [*range(1, 7)], 30.0))  # one house further on
-    assert not pieces_of_one(first, match([7, 8, 9], [7, 8, 9], 101.0))
+    assert pieces(match([7, 8, 9], [7, 8, 9], 40.0))  # one of three lies at the seam
+    assert not pieces(match([*range(6)], [*range(1, 7)], 30.0))  # one house further on
+    # The same though the reference lacks so many houses that the two share none of the map's.
+    first = match([0, 2, 4, 6], [0, 2, 4, 6], 0.0)
+    assert not pieces(match([1, 3, 5], [2, 4, 6], 30.0))
+    assert not pieces(match([7, 8, 9], [7, 8, 9], 101.0))
+    turned = replace(match([8, 9], [8, 9], 40.0), transform=Similarity((0.0, 0.0), (0.0, 0.0), math.pi))
+    assert pieces(match([8, 9], [8, 9], 40.0)) and not pieces(turned)
 
 
 def test_a_rigid_candidate_has_one_transform_everywhere() -> None:

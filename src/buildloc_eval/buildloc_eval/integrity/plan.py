@@ -99,9 +99,8 @@ ALL_BOSTON = Box(-72.0, 42.0, -70.5, 43.0)
 # The box of Tokyo is halved along a meridian, with 370 m between the halves.
 TOKYO_WEST, TOKYO_EAST = Box(139.66, 35.58, 139.703, 35.66), Box(139.707, 35.58, 139.75, 35.66)
 TOKYO_KM = (3.0, 5.0)  # the larger holds all of a half
-# A normal distribution this wide has as many offsets beyond 2.1 m, one in a thousand, as the mean offsets of
-# the same buildings in cells of 75 m have over the west, about what a map covers. Their RMS is 0.42 m.
-TOKYO_REGISTRATION_M = 0.56
+# Mean offsets of the same buildings in cells of 75 m, about what a map covers, over the west: RMS per axis.
+TOKYO_REGISTRATION_M = 0.42
 
 
 def _boston(name: str, centre_deg: tuple[float, float]) -> Place:

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from buildloc_matcher.config import matcher_config
+from buildloc_matcher.match_start import start_of
 from buildloc_matcher.matcher import Matcher, MatchResult
 from buildloc_matcher.reference.buildings import Buildings
 from buildloc_matcher.reference.database import ReferenceDatabase, assemble
 from buildloc_matcher.refinement import Refined, refine
-from buildloc_matcher.window import frames_kept, start
+from buildloc_matcher.window import frames_kept
 from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.types import Fix, FloatArray, FrameObservation, NoFix
 from numpy.typing import NDArray
@@ -126,10 +127,10 @@ def ranking(matcher: Matcher, found: MatchResult) -> Prediction:
 def _refined(
     matcher: Matcher, found: MatchResult, snapshot: Snapshot, seen: Sequence[FrameObservation]
 ) -> FloatArray | None:
-    last = max(snapshot.keyframes, key=lambda k: k.stamp_ns)
-    coarse = matcher.place(found, np.array([last.x_m, last.y_m]))
-    begun = start(coarse, snapshot.keyframes, matcher.config)
-    refined = refine(begun, seen, matcher.database.ground, matcher.config)
+    assert found.query is not None
+    ground, config = matcher.database.ground, matcher.config
+    begun = start_of(found.scores[0], found.query, snapshot.keyframes, ground, config)
+    refined = refine(begun, seen, ground, config)
     return refined.position_m if isinstance(refined, Refined) else None
 
 

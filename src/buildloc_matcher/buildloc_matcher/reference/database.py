@@ -100,7 +100,7 @@ class ReferenceDatabase:
 
     def star_corners(self, stars: NDArray[np.int64]) -> FloatArray:
         """(M, 3, 2) centroids at the corners of the stars' central triangles, by their sorted angles."""
-        if len(self.tiles) == 1:
+        if len(self.tiles) == 1:  # half the time
             tile = self.tiles[0]
             return np.asarray(tile.buildings.centroids_m[tile.triangles.vertices[stars]])
         corners = np.empty((len(stars), 3, 2))
