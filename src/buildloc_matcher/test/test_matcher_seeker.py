@@ -35,6 +35,7 @@ class Scripted:
         self.places: deque[tuple[float, float] | None] = deque()
         self.outcomes: deque[Outcome] = deque()
         self.searches = 0
+        self.spread = SPREAD  # of a fix; its agreement has SPREAD
 
     def fix(self, local_map: LocalMap, keyframes: Sequence[Keyframe], _: object) -> Answer:
         self.searches += 1
@@ -42,7 +43,7 @@ class Scripted:
         if place is None:
             return Answer(NoFix(last.stamp_ns, "nothing found"), (), {})
         agreement = Agreement({last.stamp_ns: (*place, 0.0)}, SPREAD, 1.0)
-        fix = self.fix_at(Place(last.stamp_ns, *place, 0.0, SPREAD), math.nan)
+        fix = self.fix_at(Place(last.stamp_ns, *place, 0.0, self.spread), math.nan)
         return Answer(fix, (), {}, agreement)
 
     def follow(
@@ -141,6 +142,20 @@ def test_now_and_then_the_global_search_has_to_confirm(matcher: Scripted) -> Non
     assert all(isinstance(fix, Fix) for fix in fixes[:6]) and matcher.searches == 4
     assert isinstance(fixes[6], NoFix) and "another place, 220.0 m away" in fixes[6].reason
     assert seeker.pursuit.mode is Mode.ACQUIRE
+
+
+@pytest.mark.parametrize(("sigma_m", "kept"), [(1.0, False), (10.0, True)])
+def test_a_search_that_was_carried_on_contradicts_no_better_than_it_knows(sigma_m: float, kept: bool) -> None:
+    """A fix may lie far beyond the agreement behind it: its own covariance counts, not the agreement's."""
+    matcher = Scripted(check_keyframes=2)
+    seeker = Seeker(matcher)  # type: ignore[arg-type]
+    matcher.places += [(500.0, 700.0), (585.0, 700.0)]
+    matcher.outcomes += [Outcome.ACCEPTED] * 2
+    at_keyframe(seeker, 1)
+    at_keyframe(seeker, 2)
+    matcher.spread = np.diag([sigma_m**2, sigma_m**2, 1e-3])
+    # At 561 m by what was followed; the search says 24 m on.
+    assert isinstance(at_keyframe(seeker, 3), Fix) is kept
 
 
 def test_another_submap_withdraws_before_its_map_is_solved(matcher: Scripted, seeker: Seeker) -> None:
