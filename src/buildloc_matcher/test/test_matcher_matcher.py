@@ -222,6 +222,34 @@ def test_a_flight_that_has_left_the_match_is_carried_on_with_growing_uncertainty
     seen_map, poses, seen, _ = beyond_the_town(1200.0)
     answer = Matcher(HERE, DEFAULT).fix(seen_map, poses, seen)
     assert isinstance(answer.result, NoFix)
+    assert "the match ends before the flight: uncertainty grew" in answer.result.reason
+
+
+def test_a_flight_that_goes_on_over_other_ground_than_the_reference_has_is_contradicted() -> None:
+    seen_map, poses, seen, last = beyond_the_town(600.0)
+    step = np.array([800.0, 350.0]) / 24.0
+    beyond = len(poses) - 25
+    other = []
+    for number, observation in enumerate(seen):
+        if number >= 25:
+            place = last - (beyond - 1 - (number - 25)) * step
+            level = WRONG_TOWN.centroids_m - place
+            level = level[np.hypot(*level.T) < 90.0]
+            observation = replace(observation, centroids_m=level)
+        other.append(observation)
+    answer = Matcher(HERE, DEFAULT).fix(seen_map, poses, other)
+    assert isinstance(answer.result, NoFix)
+    assert "the match ends before the flight: the reference has not what was seen" in answer.result.reason
+
+
+def test_only_rivals_have_to_be_led() -> None:
+    matcher = Matcher(HERE, DEFAULT)
+    found = matcher.locate(observed(TOWN, 60, 1, 0).local_map)
+    best = found.candidates[0]
+    other = replace(best, x_m=best.x_m + 50.0)
+    assert matcher.judge(replace(found, candidates=(best, other), rivals=())).outcome is Outcome.ACCEPTED
+    ambiguous = matcher.judge(replace(found, candidates=(best, other), rivals=(other,)))
+    assert ambiguous.outcome is Outcome.UNDECIDED and "leads another place by 0.0" in (ambiguous.reason or "")
 
 
 # Bad maps
