@@ -45,6 +45,7 @@ from buildloc_matcher.reference.buildings import OUTLINE_UNIT_M
 from buildloc_matcher.reference.database import DatabaseError, ReferenceDatabase, descriptor_hash
 from buildloc_matcher.refinement import (
     MOST_RIVAL_M,
+    RIVAL_M,
     Refined,
     Unrefined,
     covariance_enu,
@@ -339,6 +340,14 @@ class Matcher:
             told = f"{opinion.nats:.1f} nats, lead {opinion.lead:.1f} over places near by"
             loose = f"undecided: the latest frames fit loosely: {told}, for {len(seen)} buildings"
             return _Refusal(loose), figures
+        # A match may leave the true houses for others on its way, and the window bends along: its end has to
+        # fit nowhere near by better.
+        latest = seen_in_world(poses, observations, 2 * config.follow_frames)
+        near = np.diag(np.square([RIVAL_M / SIGMAS, RIVAL_M / SIGMAS, 1.0]))
+        at_end = ask(latest, np.zeros(2), near, self.database.ground, config)
+        if at_end.lead < 0.0:
+            better = f"lead {at_end.lead:.1f} nats over another place near by, for {len(latest)} buildings"
+            return _Refusal(f"undecided: the latest frames fit elsewhere: {better}"), figures
         return Agreement(poses, refined.covariance, math.exp(begun.state.log_scales[1])), figures
 
     def _catch_up(

@@ -242,6 +242,16 @@ def test_a_flight_that_goes_on_over_other_ground_than_the_reference_has_is_contr
     assert "the match ends before the flight: the reference has not what was seen" in answer.result.reason
 
 
+def test_the_end_of_a_flight_must_not_fit_better_near_by() -> None:
+    """The path of the mapper slips by 15 m before the last eight keyframes: most of the window lies right,
+    and what the latest frames saw lies 15 m beside where they put it."""
+    seen_map, poses, seen, *_ = flight(1)
+    slipped = [k if k.stamp_ns <= 17 * SECOND else replace(k, y_m=k.y_m + 15.0) for k in poses]
+    answer = Matcher(HERE, DEFAULT).fix(seen_map, slipped, seen)
+    assert isinstance(answer.result, NoFix)
+    assert "the latest frames fit elsewhere: lead -" in answer.result.reason
+
+
 def test_only_rivals_have_to_be_led() -> None:
     matcher = Matcher(HERE, DEFAULT)
     found = matcher.locate(observed(TOWN, 60, 1, 0).local_map)
