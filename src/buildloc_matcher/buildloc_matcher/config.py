@@ -97,7 +97,7 @@ class MatcherConfig:
         5.0, "smallest lead of the refined pose over another one within 20 m that fits too, nats", 0.0, 1e4
     )
     min_buildings: int = param(12, "fewest buildings in the map for a fix", 3, 100000)
-    min_jaccard: float = param(0.15, "smallest MNN-Jaccard of an accepted candidate", 0.0, 1.0)
+    min_jaccard: float = param(0.2, "smallest MNN-Jaccard of an accepted candidate", 0.0, 1.0)
     target_false_fix_rate: float = param(
         1e-4, "how often a map that lies nowhere near may be accepted, at most", 1e-12, 0.5
     )

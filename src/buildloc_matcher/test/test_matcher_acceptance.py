@@ -94,7 +94,7 @@ def test_three_outcomes() -> None:
 @pytest.mark.parametrize(
     ("found", "text"),
     [
-        (replace(GOOD, jaccard=0.12), "MNN-Jaccard 0.12, below 0.15"),
+        (replace(GOOD, jaccard=0.15), "MNN-Jaccard 0.15, below 0.2"),
         (replace(GOOD, pairs=np.zeros((9, 2), np.int64)), "matches 9 buildings, fewer than 10"),
         (replace(GOOD, rms_m=10.1), "residuals of 10.1 m, above 10 m"),
     ],
