@@ -94,7 +94,7 @@ class MatcherConfig:
         1.5, "error that all buildings of the reference share, per axis, m", 0.0, 10.0
     )
     min_optimum_lead: float = param(
-        5.0, "smallest lead of the refined pose over another one within 20 m that fits too, nats", 0.0, 1e4
+        5.0, "smallest lead of the refined pose over another one near by that fits too, nats", 0.0, 1e4
     )
     min_buildings: int = param(12, "fewest buildings in the map for a fix", 3, 100000)
     min_jaccard: float = param(0.2, "smallest MNN-Jaccard of an accepted candidate", 0.0, 1.0)
@@ -108,7 +108,7 @@ class MatcherConfig:
     )
     max_residual_m: float = param(10.0, "largest RMS distance of the matched pairs for a fix, m", 0.1, 1000.0)
     sigma_up_m: float = param(100.0, "standard deviation reported for the altitude, m", 0.1, 10000.0)
-    follow_frames: int = param(4, "latest keyframes whose buildings agree with the reference or not", 1, 100)
+    follow_frames: int = param(4, "fewest latest keyframes that are asked whether they agree", 1, 100)
     follow_nats: float = param(
         7.0, "evidence that decides for or against a predicted place, nats; less decides nothing", 0.1, 1e3
     )
