@@ -375,10 +375,8 @@ class Matcher:
             if followed.agreement is not None:
                 agreement = followed.agreement
                 pursuit = agree(pursuit, agreement, config)
-        last = path[-1]
-        anchor = pursuit.anchors[last.stamp_ns]
-        place = Place(last.stamp_ns, anchor.x_m, anchor.y_m, anchor.yaw_rad, anchor.uncertainty(config))
-        return _Caught(place, agreement)
+        last_ns = path[-1].stamp_ns
+        return _Caught(pursuit.anchors[last_ns].place(last_ns, config), agreement)
 
     def fix_at(self, place: Place, altitude_m: float) -> Fix:
         """The fix of a camera at a place."""

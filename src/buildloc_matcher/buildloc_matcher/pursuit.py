@@ -70,6 +70,10 @@ class Anchor:
         """(3, 3) covariance east, north, yaw, what the flight since the agreement added included."""
         return np.asarray(self.covariance + drift_covariance(self.flown_m, config), dtype=np.float64)
 
+    def place(self, stamp_ns: int, config: MatcherConfig) -> Place:
+        """The place of the keyframe, of this stamp."""
+        return Place(stamp_ns, self.x_m, self.y_m, self.yaw_rad, self.uncertainty(config))
+
     def ahead(self, x_m: float, y_m: float, yaw_rad: float, scale: float) -> Anchor:
         """The anchor of a pose in this one's level camera frame; ``scale`` is that between the two."""
         dx, dy = self.scale * rotation(self.yaw_rad) @ (x_m, y_m)

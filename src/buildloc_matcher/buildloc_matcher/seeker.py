@@ -99,13 +99,10 @@ class Seeker:
         with self._lock:
             pursuit, flight = self.pursuit, self._flight
         last = max(keyframes, key=lambda k: k.stamp_ns, default=None)
-        anchor = None if last is None else pursuit.anchors.get(last.stamp_ns)
-        if last is None or anchor is None:
+        if last is None or last.stamp_ns not in pursuit.anchors:
             answer, step = self._acquire(local_map, keyframes, observations)
         else:
-            answer, step = self._follow(
-                anchor, pursuit.unanswered(last.stamp_ns), last, local_map, keyframes, observations
-            )
+            answer, step = self._follow(pursuit, last, local_map, keyframes, observations)
         with self._lock:
             if flight is not self._flight:
                 return Answer(NoFix(local_map.stamp_ns, "the flight was forgotten meanwhile"), (), {})
@@ -133,14 +130,14 @@ class Seeker:
 
     def _follow(
         self,
-        anchor: Anchor,
-        unanswered: int,
+        pursuit: Pursuit,
         last: Keyframe,
         local_map: LocalMap,
         keyframes: Sequence[Keyframe],
         observations: Sequence[FrameObservation],
     ) -> tuple[Answer, Step]:
         matcher, config = self.matcher, self.matcher.config
+        anchor = pursuit.anchors[last.stamp_ns]
         self._unchecked += 1
         if self._unchecked >= config.check_keyframes:
             self._unchecked = 0
@@ -148,15 +145,15 @@ class Seeker:
             if (elsewhere := self._elsewhere(found, anchor)) is not None:
                 none = NoFix(last.stamp_ns, elsewhere)
                 return Answer(none, found.candidates, found.funnel), partial(withdraw, reason=elsewhere)
-        uncertainty = anchor.uncertainty(config)
+        place, unanswered = anchor.place(last.stamp_ns, config), pursuit.unanswered(last.stamp_ns)
         predicted = prediction(anchor, last)
-        followed = matcher.follow(predicted, uncertainty, keyframes, observations, unanswered)
+        followed = matcher.follow(predicted, place.covariance, keyframes, observations, unanswered)
         opinion, agreement = followed.opinion, followed.agreement
         funnel = {"follow_nats": opinion.nats, "follow_lead": opinion.lead}
         if opinion.outcome is Outcome.REJECTED:
             none = NoFix(last.stamp_ns, opinion.reason)
             return Answer(none, (), funnel), partial(withdraw, reason=opinion.reason)
-        place, step = Place(last.stamp_ns, anchor.x_m, anchor.y_m, anchor.yaw_rad, uncertainty), coast
+        step: Step = coast
         if agreement is not None:
             place = Place(last.stamp_ns, *agreement.poses[last.stamp_ns], agreement.covariance)
             step = partial(agree, agreement=agreement, config=config)

@@ -297,13 +297,10 @@ class _Fit:
         information[-5:] = 1.0 / np.square([place, place, turn, scale, scale])
         return information
 
-    def _walked(self) -> FloatArray:
-        """(3 K + 2, 3 K + 2) information of the steps between keyframes."""
-        return np.asarray((self._step_jacobian.T * self._step_information) @ self._step_jacobian)
-
     def information(self, weights: FloatArray) -> FloatArray:
         """All information with these weights of the observations."""
-        return np.asarray(self._observed(weights) + self._walked() + np.diag(self._prior()))
+        walked = (self._step_jacobian.T * self._step_information) @ self._step_jacobian
+        return np.asarray(self._observed(weights) + walked + np.diag(self._prior()))
 
     def gradient(self) -> FloatArray:
         """(3 K + 2,) by which the normal equations give the step."""
@@ -322,7 +319,7 @@ class _Fit:
         mean squared influence over it, per building, less the freedom that the poses take.
         """
         observed = self._observed(self.weights**2)
-        rest = self._walked() + np.diag(self._prior())
+        rest = self.information(np.zeros_like(self.weights))
         weights2 = self._means(self.weights) ** 2
         taken = float(np.trace(np.linalg.solve(observed + rest, observed)))
         told = self._means(np.trace(self._certainty, axis1=1, axis2=2))
