@@ -9,17 +9,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from buildloc_msgs_py.types import FloatArray, FrameObservation
+from buildloc_msgs_py.types import FloatArray, FrameObservation, Keyframe
 from scipy.special import logsumexp
 
-from buildloc_matcher.acceptance import Outcome
+from buildloc_matcher.acceptance import Outcome, refuse_refined
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.evidence import GATE_SIGMAS, Ground, placed_evidence
-from buildloc_matcher.geometry import rotation
-from buildloc_matcher.pursuit import Pose, sigma_m
+from buildloc_matcher.geometry import Similarity, rotation, wrap
+from buildloc_matcher.pursuit import Agreement, Pose, sigma_m, sigmas_apart
+from buildloc_matcher.refinement import Refined, Unrefined, refine, registration_covariance
+from buildloc_matcher.window import start
 
 SIGMAS = 3.0  # the uncertainty of a prediction reaches this far
 ONE_BUILDING_M = 6.0  # buildings of two frames nearer than this are the same
@@ -34,6 +36,14 @@ class Opinion:
     reason: str
     nats: float
     lead: float
+
+
+@dataclass(frozen=True)
+class Followed:
+    """What the reference says about a prediction, and with an agreement what it agrees to."""
+
+    opinion: Opinion
+    agreement: Agreement | None
 
 
 def seen_in_world(
@@ -87,3 +97,47 @@ def ask(
     if lead >= config.follow_nats and nats - chances >= config.follow_nats:
         return opinion(Outcome.ACCEPTED, told)
     return opinion(Outcome.UNDECIDED, f"the reference could not tell: {told}, lead {lead:.1f}")
+
+
+def follow(
+    predicted: Similarity,
+    covariance: FloatArray,
+    keyframes: Sequence[Keyframe],
+    observations: Sequence[FrameObservation],
+    reference: Ground,
+    config: MatcherConfig,
+    unanswered: int = 0,
+) -> Followed:
+    """Whether the reference agrees that the last keyframe lies where ``predicted`` (map -> world) puts it, up
+    to a covariance (3, 3) over east, north and yaw, the reference's registration included; after so many
+    keyframes without an agreement."""
+    last = max(keyframes, key=lambda k: k.stamp_ns)
+    begun = start(predicted, keyframes, config, sigma_m(covariance))
+    refined = refine(begun, observations, reference, config)
+    poses = refined.poses if isinstance(refined, Refined) else _placed(predicted, keyframes)
+    offset = np.array(poses[last.stamp_ns]) - np.array(_placed(predicted, [last])[last.stamp_ns])
+    offset[2] = wrap(offset[2])
+    frames = config.follow_frames
+    if isinstance(refined, Refined):  # else older frames lie where no fit has bent the path to
+        frames = min(max(frames, unanswered), config.refine_frames)
+    seen = seen_in_world(poses, observations, frames)
+    opinion = ask(seen, offset[:2], covariance, reference, config)
+    if opinion.outcome is not Outcome.ACCEPTED:
+        return Followed(opinion, None)
+    refused = refined.reason if isinstance(refined, Unrefined) else refuse_refined(refined, config)
+    if isinstance(refined, Unrefined) or refused is not None:
+        return Followed(replace(opinion, outcome=Outcome.UNDECIDED, reason=refused or ""), None)
+    apart = sigmas_apart(offset, covariance, refined.covariance, registration_covariance(config))
+    if apart > config.max_jump_sigmas:
+        jump = f"the place jumped by {math.hypot(*offset[:2]):.1f} m, {apart:.1f} standard deviations"
+        return Followed(replace(opinion, outcome=Outcome.REJECTED, reason=jump), None)
+    return Followed(opinion, Agreement(refined.poses, refined.covariance, predicted.scale))
+
+
+def _placed(similarity: Similarity, keyframes: Sequence[Keyframe]) -> dict[int, Pose]:
+    """x, y and yaw of keyframes in the world, by stamp."""
+    places = similarity.apply(np.array([(k.x_m, k.y_m) for k in keyframes])).tolist()
+    return {
+        k.stamp_ns: (x, y, k.yaw_rad + similarity.yaw_rad)
+        for k, (x, y) in zip(keyframes, places, strict=True)
+    }

@@ -11,50 +11,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 from buildloc_msgs_py.types import Candidate, Fix, FloatArray, FrameObservation, Keyframe, LocalMap, NoFix
 
-from buildloc_matcher.acceptance import (
-    Outcome,
-    Verdict,
-    judge_candidate,
-    lead,
-    log_odds,
-    refuse_refined,
-    score,
-)
+from buildloc_matcher.acceptance import Outcome, Verdict, judge_candidate, lead, log_odds, score
+from buildloc_matcher.acquisition import NotAcquired, acquire
 from buildloc_matcher.config import MatcherConfig, check_matcher
 from buildloc_matcher.evidence import QueryMap, query_map, seed_evidence
-from buildloc_matcher.follow import SIGMAS, Opinion, ask, seen_in_world
+from buildloc_matcher.follow import Followed, follow
 from buildloc_matcher.geometry import Similarity, wrap
 from buildloc_matcher.hypotheses import hypothesize
 from buildloc_matcher.local_map import check_map
 from buildloc_matcher.match_cache import MakeStarMatcher, MatchCache, StarMatcher
-from buildloc_matcher.match_start import ends, start_of
 from buildloc_matcher.mesh import Mesh, mesh
-from buildloc_matcher.pursuit import (
-    Agreement,
-    Mode,
-    Place,
-    Pose,
-    Pursuit,
-    agree,
-    carry,
-    prediction,
-    sigma_m,
-    sigmas_apart,
-)
+from buildloc_matcher.pursuit import Agreement, Place
 from buildloc_matcher.reference.buildings import OUTLINE_UNIT_M
 from buildloc_matcher.reference.database import DatabaseError, ReferenceDatabase, descriptor_hash
-from buildloc_matcher.refinement import (
-    MOST_RIVAL_M,
-    RIVAL_M,
-    Refined,
-    Unrefined,
-    covariance_enu,
-    refine,
-    registration_covariance,
-)
+from buildloc_matcher.refinement import covariance_enu, refine
 from buildloc_matcher.selection import Score, local_transform, pieces_of_one, select
 from buildloc_matcher.voting import Cluster, vote
-from buildloc_matcher.window import frames_kept, newest, start
+from buildloc_matcher.window import start
 
 FEWEST_BUILDINGS = 4
 WARM_UP_BUILDINGS = 40
@@ -85,30 +58,6 @@ class Answer:
     candidates: tuple[Candidate, ...]
     funnel: dict[str, float]
     agreement: Agreement | None = None
-
-
-@dataclass(frozen=True)
-class Followed:
-    """What the reference says about a prediction, and with an agreement what it agrees to."""
-
-    opinion: Opinion
-    agreement: Agreement | None
-
-
-@dataclass(frozen=True)
-class _Refusal:
-    """Why a piece of the flight gave no place, and whether the reference spoke against it."""
-
-    reason: str
-    contradicted: bool = False
-
-
-@dataclass(frozen=True)
-class _Caught:
-    """The place of a flight's last keyframe, and the latest agreement on the way there."""
-
-    place: Place
-    agreement: Agreement
 
 
 @dataclass(frozen=True)
@@ -287,96 +236,16 @@ class Matcher:
         verdict = self.judge(found)
         if verdict.reason is not None:
             return none(verdict.reason)
-        path, reasons = newest(keyframes, frames_kept(self.config)), list[str]()
         assert found.query is not None
-        for end in ends(found.scores[0], found.query, path, self.config):
-            agreed, figures = self._agree(found, path[:end], observations)
-            funnel |= {} if reasons else figures
-            if isinstance(agreed, _Refusal):
-                reasons.append(agreed.reason)
-                continue
-            caught = self._catch_up(agreed, end, path, observations)
-            if isinstance(caught, _Refusal):
-                reasons.append(caught.reason)
-                if caught.contradicted:
-                    break
-                continue
-            funnel |= figures | {"refine_tries": len(reasons) + 1.0}
-            last = path[-1].stamp_ns
-            altitude = next((o.altitude_m for o in observations if o.stamp_ns == last), float("nan"))
-            return Answer(self.fix_at(caught.place, altitude), found.candidates, funnel, caught.agreement)
-        return none("; earlier in the flight: ".join(dict.fromkeys((reasons[0], reasons[-1]))))
-
-    def _agree(
-        self, found: MatchResult, path: Sequence[Keyframe], observations: Sequence[FrameObservation]
-    ) -> tuple[Agreement | _Refusal, dict[str, float]]:
-        """What the reference agrees to at the end of a path, by the best candidate, or why it does not; and
-        the figures behind it."""
-        config = self.config
-        assert found.query is not None
-        begun = start_of(found.scores[0], found.query, path, self.database.ground, config)
-        if SIGMAS * begun.sigma_m > MOST_RIVAL_M:
-            far = f"the flight has left the matched buildings, its place is open by {begun.sigma_m:.0f} m"
-            return _Refusal(f"undecided: {far}"), {}
-        refined = refine(begun, observations, self.database.ground, config)
-        if isinstance(refined, Unrefined):
-            return _Refusal(refined.reason), {}
-        figures: dict[str, float] = {
-            "refine_observed": refined.observed, "refine_pairs": refined.pairs,
-            "refine_buildings": refined.buildings, "refine_rms_m": refined.rms_m,
-        }  # fmt: skip
-        refused = refuse_refined(refined, config)
-        if refused is not None:
-            return _Refusal(refused), figures
-        poses = _refined(refined)
-        seen = seen_in_world(poses, observations, len(begun.keyframes))
-        offset = refined.position_m - begun.state.poses[-1, :2]
-        opinion = ask(seen, offset, begun.covariance, self.database.ground, config)
-        figures |= {"recent_nats": opinion.nats, "recent_lead": opinion.lead, "recent_buildings": len(seen)}
-        if opinion.outcome is not Outcome.ACCEPTED:
-            return _Refusal(f"undecided: the latest frames do not agree: {opinion.reason}"), figures
-        if min(opinion.nats, opinion.lead) < config.min_recent_nats * len(seen):
-            # Where houses stand close, many a place lays most of them near some house.
-            told = f"{opinion.nats:.1f} nats, lead {opinion.lead:.1f} over places near by"
-            loose = f"undecided: the latest frames fit loosely: {told}, for {len(seen)} buildings"
-            return _Refusal(loose), figures
-        # A match may leave the true houses for others on its way, and the window bends along: its end has to
-        # fit nowhere near by better.
-        latest = seen_in_world(poses, observations, 2 * config.follow_frames)
-        near = np.diag(np.square([RIVAL_M / SIGMAS, RIVAL_M / SIGMAS, 1.0]))
-        at_end = ask(latest, np.zeros(2), near, self.database.ground, config)
-        if at_end.lead < 0.0:
-            better = f"lead {at_end.lead:.1f} nats over another place near by, for {len(latest)} buildings"
-            return _Refusal(f"undecided: the latest frames fit elsewhere: {better}"), figures
-        return Agreement(poses, refined.covariance, math.exp(begun.state.log_scales[1])), figures
-
-    def _catch_up(
-        self,
-        agreement: Agreement,
-        known: int,
-        path: Sequence[Keyframe],
-        observations: Sequence[FrameObservation],
-    ) -> _Caught | _Refusal:
-        """From an agreement about the first ``known`` keyframes of a path to the place of its last one, by
-        following the flight in between; or why that is not known."""
-        config = self.config
-        pursuit = agree(Pursuit(keyframes=tuple(path[:known])), agreement, config)
-        while known < len(path):
-            known = min(known + config.follow_frames, len(path))
-            pursuit = carry(pursuit, path[:known], config)
-            if pursuit.mode is Mode.ACQUIRE:
-                return _Refusal(f"the match ends before the flight: {pursuit.withdrawn}")
-            anchor, last = pursuit.anchors[path[known - 1].stamp_ns], path[known - 1]
-            predicted, uncertainty = prediction(anchor, last), anchor.uncertainty(config)
-            unanswered = pursuit.unanswered(last.stamp_ns)
-            followed = self.follow(predicted, uncertainty, path[:known], observations, unanswered)
-            if followed.opinion.outcome is Outcome.REJECTED:
-                return _Refusal(f"the match ends before the flight: {followed.opinion.reason}", True)
-            if followed.agreement is not None:
-                agreement = followed.agreement
-                pursuit = agree(pursuit, agreement, config)
-        last_ns = path[-1].stamp_ns
-        return _Caught(pursuit.anchors[last_ns].place(last_ns, config), agreement)
+        acquired = acquire(
+            found.scores[0], found.query, keyframes, observations, self.database.ground, self.config
+        )
+        funnel |= acquired.figures
+        if isinstance(acquired, NotAcquired):
+            return none(acquired.reason)
+        place, agreement = acquired.place, acquired.agreement
+        altitude = next((o.altitude_m for o in observations if o.stamp_ns == place.stamp_ns), float("nan"))
+        return Answer(self.fix_at(place, altitude), found.candidates, funnel, agreement)
 
     def fix_at(self, place: Place, altitude_m: float) -> Fix:
         """The fix of a camera at a place."""
@@ -398,38 +267,5 @@ class Matcher:
         """Whether the reference agrees that the last keyframe lies where ``predicted`` (map -> world) puts
         it, up to a covariance (3, 3) over east, north and yaw, the reference's registration included; after
         so many keyframes without an agreement."""
-        config, reference = self.config, self.database.ground
-        last = max(keyframes, key=lambda k: k.stamp_ns)
-        begun = start(predicted, keyframes, config, sigma_m(covariance))
-        refined = refine(begun, observations, reference, config)
-        poses = _refined(refined) if isinstance(refined, Refined) else _placed(predicted, keyframes)
-        offset = np.array(poses[last.stamp_ns]) - np.array(_placed(predicted, [last])[last.stamp_ns])
-        offset[2] = wrap(offset[2])
-        frames = config.follow_frames
-        if isinstance(refined, Refined):  # else older frames lie where no fit has bent the path to
-            frames = min(max(frames, unanswered), config.refine_frames)
-        seen = seen_in_world(poses, observations, frames)
-        opinion = ask(seen, offset[:2], covariance, reference, config)
-        if opinion.outcome is not Outcome.ACCEPTED:
-            return Followed(opinion, None)
-        refused = refined.reason if isinstance(refined, Unrefined) else refuse_refined(refined, config)
-        if isinstance(refined, Unrefined) or refused is not None:
-            return Followed(replace(opinion, outcome=Outcome.UNDECIDED, reason=refused or ""), None)
-        apart = sigmas_apart(offset, covariance, refined.covariance, registration_covariance(config))
-        if apart > config.max_jump_sigmas:
-            jump = f"the place jumped by {math.hypot(*offset[:2]):.1f} m, {apart:.1f} standard deviations"
-            return Followed(replace(opinion, outcome=Outcome.REJECTED, reason=jump), None)
-        return Followed(opinion, Agreement(poses, refined.covariance, predicted.scale))
-
-
-def _refined(refined: Refined) -> dict[int, Pose]:
-    return {stamp: (float(x), float(y), float(yaw)) for stamp, (x, y, yaw) in refined.poses.items()}
-
-
-def _placed(similarity: Similarity, keyframes: Sequence[Keyframe]) -> dict[int, Pose]:
-    """x, y and yaw of keyframes in the world, by stamp."""
-    places = similarity.apply(np.array([(k.x_m, k.y_m) for k in keyframes])).tolist()
-    return {
-        k.stamp_ns: (x, y, k.yaw_rad + similarity.yaw_rad)
-        for k, (x, y) in zip(keyframes, places, strict=True)
-    }
+        reference = self.database.ground
+        return follow(predicted, covariance, keyframes, observations, reference, self.config, unanswered)

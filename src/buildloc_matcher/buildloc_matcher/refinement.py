@@ -17,7 +17,7 @@ from buildloc_matcher.evidence import GATE_SIGMAS, Ground
 from buildloc_matcher.geometry import Similarity, fit_rigid, wrap
 from buildloc_matcher.outline_fit import walls
 from buildloc_matcher.point_grid import within
-from buildloc_matcher.pursuit import drift_covariance
+from buildloc_matcher.pursuit import Pose, drift_covariance
 from buildloc_matcher.reference.buildings import OUTLINE_UNIT_M
 from buildloc_matcher.window import (
     Pairing,
@@ -51,13 +51,13 @@ LATEST_BUILDINGS = 3  # that tell where the last keyframe is
 class Refined:
     """The last keyframe's camera at its capture time: ``position_m`` (2,) of the ground point below it and
     ``yaw_rad``, with ``covariance`` (3, 3) over east m, north m and yaw rad, in which the reference's own
-    registration is counted. ``poses``: (3,) x, y, yaw in the world of every keyframe of the window, by stamp.
+    registration is counted. ``poses``: x, y and yaw in the world of every keyframe of the window, by stamp.
     The evidence: observations pooled, matched pairs, distinct reference buildings, and the residuals' RMS."""
 
     position_m: FloatArray
     yaw_rad: float
     covariance: FloatArray
-    poses: Mapping[int, FloatArray]
+    poses: Mapping[int, Pose]
     observed: int
     pairs: int
     buildings: int
@@ -115,8 +115,10 @@ def refine(
     covariance += registration_covariance(config)
     covariance += drift_covariance(_unseen_m(window, solution, config), config)
     position, yaw = solution.state.poses[-1, :2], float(wrap(solution.state.poses[-1, 2]))
+    placed_at = zip(window.stamps_ns, solution.state.poses.tolist(), strict=True)
+    poses = {stamp: (x, y, heading) for stamp, (x, y, heading) in placed_at}
     return Refined(
-        position, yaw, covariance, dict(zip(window.stamps_ns, solution.state.poses, strict=True)),
+        position, yaw, covariance, poses,
         len(window.level_m), len(solution.pairs), solution.pairs.seen,
         math.sqrt(float(np.mean(np.sum(solution.residuals_m**2, axis=1)))),
     )  # fmt: skip

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from buildloc_matcher.acceptance import Outcome
-from buildloc_matcher.follow import ask, seen_in_world
+from buildloc_matcher.follow import Followed, ask, seen_in_world
 from buildloc_matcher.geometry import Similarity, rotation, wrap
-from buildloc_matcher.matcher import Followed, Matcher
+from buildloc_matcher.matcher import Matcher
 from buildloc_matcher.refinement import registration_covariance
 from buildloc_msgs_py.types import FloatArray, FrameObservation, Keyframe
 from towns import DEFAULT, ORIGIN_M, Buildings, alike, lattice, town, whole

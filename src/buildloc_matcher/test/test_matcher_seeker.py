@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from buildloc_matcher.acceptance import Outcome
 from buildloc_matcher.config import MatcherConfig
-from buildloc_matcher.follow import Opinion
+from buildloc_matcher.follow import Followed, Opinion
 from buildloc_matcher.geometry import Similarity
-from buildloc_matcher.matcher import Answer, Followed
+from buildloc_matcher.matcher import Answer
 from buildloc_matcher.pursuit import Agreement, Mode, Place
 from buildloc_matcher.seeker import UNTRACKED, WAITING, Seeker
 from buildloc_msgs_py.types import Fix, FloatArray, FrameObservation, Keyframe, LocalMap, NoFix, Tracked
