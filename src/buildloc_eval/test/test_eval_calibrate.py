@@ -8,13 +8,36 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from buildloc_eval.integrity.calibrate import AT_RATE, START_NATS, calibrate, fit_tail, write_calibration
-from buildloc_matcher.calibration import Tail
+from buildloc_eval.integrity.calibrate import (
+    AT_RATE,
+    START_NATS,
+    calibrate,
+    fit_errors,
+    fit_tail,
+    write_calibration,
+)
+from buildloc_matcher.calibration import PROTECTED, Errors, Tail
 from buildloc_msgs_py.errors import BuildlocError
+
+STUDENT = Errors(0.8, 8.0)
+
+
+def controls(kind: str, scores: np.ndarray, best_error_m: float) -> pd.DataFrame:
+    told = {"score": scores, "best_error_m": best_error_m, "fix_error_m": np.nan, "nees": np.nan}
+    return pd.DataFrame({"kind": kind, "control": True, "fixed": False, **told})
 
 
 def wrong(kind: str, scores: np.ndarray) -> pd.DataFrame:
-    return pd.DataFrame({"kind": kind, "score": scores, "best_error_m": np.inf})
+    return controls(kind, scores, np.inf)
+
+
+def flights(count: int) -> pd.DataFrame:
+    """Right fixes whose errors follow STUDENT, found by best candidates of which some are wrong."""
+    rng = np.random.default_rng(3)
+    chi2 = rng.chisquare(STUDENT.dof, count) / STUDENT.dof
+    nees = STUDENT.scale**2 * np.sum(rng.normal(0.0, 1.0, (2, count)) ** 2, axis=0) / chi2
+    told = {"score": 90.0, "best_error_m": 500.0, "fix_error_m": 1.0, "nees": nees}
+    return pd.DataFrame({"kind": "flight", "control": False, "fixed": True, **told})
 
 
 def exponential(seed: int, count: int, scale_nats: float) -> np.ndarray:
@@ -32,10 +55,9 @@ def test_the_bounds_hold_in_nineteen_of_twenty_fits() -> None:
 
 
 def test_the_worst_kind_counts_and_right_candidates_do_not() -> None:
-    right = pd.DataFrame({"kind": "missing", "score": np.full(100, 90.0), "best_error_m": 3.0})
-    records = pd.concat(
-        [wrong("outside", exponential(1, 500, 2.0)), wrong("grid", exponential(2, 500, 4.0)), right]
-    )
+    right = controls("missing", np.full(100, 90.0), 3.0)
+    some = [wrong("outside", exponential(1, 500, 2.0)), wrong("grid", exponential(2, 500, 4.0))]
+    records = pd.concat([*some, right, flights(300)])
     found = calibrate(records)
     assert found["worst"] == "grid" and found["kinds"].keys() == {"outside", "grid"}
     assert found["kinds"]["grid"]["wrong"] == 500
@@ -43,19 +65,32 @@ def test_the_worst_kind_counts_and_right_candidates_do_not() -> None:
 
 
 def test_a_kind_that_seldom_scores_has_the_largest_scale() -> None:
-    records = pd.concat([wrong("outside", exponential(1, 500, 2.0)), wrong("mirrored", np.full(50, -np.inf))])
-    assert calibrate(records)["kinds"]["mirrored"]["wrong"] == 50
+    some = [wrong("outside", exponential(1, 500, 2.0)), wrong("mirrored", np.full(50, -np.inf))]
+    assert calibrate(pd.concat([*some, flights(300)]))["kinds"]["mirrored"]["wrong"] == 50
     assert fit_tail(np.full(50, -np.inf), 3.0) == Tail(START_NATS, pytest.approx(0.058, abs=1e-3), 3.0)
+
+
+def test_the_tail_of_errors_is_found_again() -> None:
+    many = flights(20_000)
+    found = fit_errors(many.nees.to_numpy())
+    assert found.scale == pytest.approx(STUDENT.scale, rel=0.03)
+    assert found.dof == pytest.approx(STUDENT.dof, rel=0.15)
+    beyond = np.mean(many.nees > STUDENT.radius(PROTECTED) ** 2)
+    assert beyond == pytest.approx(1.0 - PROTECTED, rel=0.5)
 
 
 def test_too_few_and_the_wrong_plan_are_said(tmp_path: Path) -> None:
     file = tmp_path / "calibration.json"
     with pytest.raises(BuildlocError, match="too few wrong candidates"):
         calibrate(wrong("outside", np.full(20, -5.0)))
-    some = wrong("outside", exponential(1, 500, 2.0))
+    controls_only = wrong("outside", exponential(1, 500, 2.0))
+    with pytest.raises(BuildlocError, match="too few fixes"):
+        calibrate(controls_only)
+    some = pd.concat([controls_only, flights(300)])
     with pytest.raises(BuildlocError, match="use --plan calibration"):
         write_calibration(file, some, "test", 1)
     assert not file.exists()
     line = write_calibration(file, some, "calibration", 1)
     assert "nats for a rate of 0.0001 (outside)" in line
     assert Tail(**json.loads(file.read_text())["tail"]).share > 0.1
+    assert Errors(**json.loads(file.read_text())["errors"]).dof < 20.0

@@ -39,6 +39,7 @@ from buildloc_eval.integrity.plan import (
 from buildloc_eval.integrity.report import report_of, write
 from buildloc_eval.integrity.trials import attempt, other_city, run
 from buildloc_eval.paper.store import StaleError
+from buildloc_matcher.calibration import protection_level_m
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.reference.buildings import Buildings, concatenate
 from buildloc_matcher.reference.database import MANIFEST, DatabaseError
@@ -82,12 +83,12 @@ def first(kind: str, detail: str = "") -> int:
     return next(n for n in numbers if detail in trial(TINY, 1, n).detail)
 
 
-@pytest.mark.parametrize(("plan", "flights"), [(TEST, 3200), (CALIBRATION, 0)], ids=["test", "calibration"])
+@pytest.mark.parametrize(
+    ("plan", "flights"), [(TEST, 3200), (CALIBRATION, 2000)], ids=["test", "calibration"]
+)
 def test_controls_of_equal_kinds_everywhere(plan: Plan, flights: int) -> None:
     drawn = [trial(plan, 1, n) for n in range(4000)]
-    kinds = dict.fromkeys(CONTROLS, (4000 - flights) // len(CONTROLS)) | (
-        {FLIGHT: flights} if flights else {}
-    )
+    kinds = dict.fromkeys(CONTROLS, (4000 - flights) // len(CONTROLS)) | {FLIGHT: flights}
     assert Counter(one.kind for one in drawn) == kinds
     for place in plan.places:
         assert {one.kind for one in drawn if one.place == place} == set(kinds)
@@ -318,8 +319,8 @@ def test_the_curve_trades_availability_for_false_fixes() -> None:
 def test_consistency_counts_errors_within_their_bounds() -> None:
     row = scoring.consistency(made_up())[0]  # of the one right fix
     assert row["fixes"] == 1 and row["within 95 % bound"]["share"] == 1.0
-    # The longer axis has 2 m: 2 sqrt(13.82) m are exceeded once in a thousand.
-    assert row["median protection level_m"] == pytest.approx(7.434, abs=1e-3)
+    longer_axis = np.diag([4.0, 4.0])
+    assert row["median protection level_m"] == pytest.approx(protection_level_m(longer_axis))
     reliability = scoring.tail_reliability(made_up())
     assert reliability[0]["observed"] == scoring.share(2, 2)  # trials 2 and 4 have a wrong best candidate
     assert reliability[-1] == {"claimed": 1e-5, "observed": scoring.share(1, 2)}

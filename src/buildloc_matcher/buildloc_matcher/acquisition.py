@@ -18,7 +18,7 @@ from buildloc_msgs_py.types import FrameObservation, Keyframe
 from buildloc_matcher.acceptance import Outcome, refuse_refined
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.evidence import Ground, QueryMap
-from buildloc_matcher.follow import SIGMAS, ask, follow, seen_in_world
+from buildloc_matcher.follow import SIGMAS, Opinion, ask, follow, seen_in_world
 from buildloc_matcher.match_start import ends, start_of
 from buildloc_matcher.pursuit import Agreement, Mode, Place, Pursuit, agree, carry, prediction
 from buildloc_matcher.refinement import MOST_RIVAL_M, RIVAL_M, Unrefined, refine
@@ -110,20 +110,28 @@ def _agree(
     figures |= {"recent_nats": opinion.nats, "recent_lead": opinion.lead, "recent_buildings": len(seen)}
     if opinion.outcome is not Outcome.ACCEPTED:
         return _Refusal(f"undecided: the latest frames do not agree: {opinion.reason}"), figures
-    if min(opinion.nats, opinion.lead) < config.min_recent_nats * len(seen):
-        # Where houses stand close, many a place lays most of them near some house.
-        told = f"{opinion.nats:.1f} nats, lead {opinion.lead:.1f} over places near by"
-        loose = f"undecided: the latest frames fit loosely: {told}, for {len(seen)} buildings"
-        return _Refusal(loose), figures
-    # A match may leave the true houses for others on its way, and the window bends along: its end has to
-    # fit nowhere near by better.
-    latest = seen_in_world(refined.poses, observations, 2 * config.follow_frames)
+    if (told := _loose(opinion, len(seen), config)) is not None:
+        return _Refusal(f"undecided: the recent frames fit loosely: {told}"), figures
+    # A match may leave the true houses for others on its way, and the window bends along: its end has to fit
+    # by itself, and nowhere near by better.
     near = np.diag(np.square([RIVAL_M / SIGMAS, RIVAL_M / SIGMAS, 1.0]))
-    at_end = ask(latest, np.zeros(2), near, reference, config)
-    if at_end.lead < 0.0:
-        better = f"lead {at_end.lead:.1f} nats over another place near by, for {len(latest)} buildings"
-        return _Refusal(f"undecided: the latest frames fit elsewhere: {better}"), figures
+    for frames in (config.follow_frames, 2 * config.follow_frames):
+        latest = seen_in_world(refined.poses, observations, frames)
+        at_end = ask(latest, np.zeros(2), near, reference, config)
+        if at_end.lead < 0.0:
+            better = f"lead {at_end.lead:.1f} nats over another place near by, for {len(latest)} buildings"
+            return _Refusal(f"undecided: the latest frames fit elsewhere: {better}"), figures
+    if (told := _loose(at_end, len(latest), config)) is not None:
+        return _Refusal(f"undecided: the latest frames fit loosely: {told}"), figures
     return Agreement(refined.poses, refined.covariance, math.exp(begun.state.log_scales[1])), figures
+
+
+def _loose(opinion: Opinion, buildings: int, config: MatcherConfig) -> str | None:
+    """The figures of an opinion that so many buildings support too little; None where they do. Where houses
+    stand close, many a place lays most of them near some house."""
+    if min(opinion.nats, opinion.lead) >= config.min_recent_nats * buildings:
+        return None
+    return f"{opinion.nats:.1f} nats, lead {opinion.lead:.1f} over places near by, for {buildings} buildings"
 
 
 def _catch_up(

@@ -1,4 +1,5 @@
-"""How high the score of a best candidate gets where the map lies nowhere near: measured, not assumed.
+"""How high the score of a best candidate gets where the map lies nowhere near, and how far errors of fixes go
+beyond what a normal distribution of their covariance has: measured, not assumed.
 
 ``calibration.json`` is written by ``buildloc eval integrity --plan calibration --write-calibration``.
 """
@@ -11,7 +12,11 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 
+import numpy as np
+from buildloc_msgs_py.types import FloatArray
+
 FILE = "calibration.json"
+PROTECTED = 0.999
 
 
 @dataclass(frozen=True)
@@ -33,18 +38,46 @@ class Tail:
         return self.start_nats + self.scale_nats * max(0.0, math.log(self.share / rate))
 
 
+@dataclass(frozen=True)
+class Errors:
+    """Errors of fixes over their standard deviations follow Student's t in the plane: times ``scale``, with
+    ``dof`` degrees of freedom; the fewer, the heavier the tail."""
+
+    scale: float
+    dof: float
+
+    def radius(self, probability: float) -> float:
+        """Standard deviations that the error stays within with this probability."""
+        return self.scale * math.sqrt(self.dof * ((1.0 - probability) ** (-2.0 / self.dof) - 1.0))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What was measured."""
+
+    tail: Tail
+    errors: Errors
+
+
 @cache
-def measured() -> Tail:
-    """The tail as it was measured."""
+def measured() -> Calibration:
+    """The calibration that is installed."""
     kept = json.loads((files("buildloc_matcher") / FILE).read_text())
-    return Tail(**kept["tail"])
+    return Calibration(Tail(**kept["tail"]), Errors(**kept["errors"]))
 
 
 def false_fix_probability(nats: float) -> float:
     """How often a map that lies nowhere near scores as high."""
-    return measured().exceedance(nats)
+    return measured().tail.exceedance(nats)
 
 
 def threshold(rate: float) -> float:
     """Smallest score of a fix at a rate of false fixes, nats."""
-    return measured().quantile(rate)
+    return measured().tail.quantile(rate)
+
+
+def protection_level_m(covariance_m2: FloatArray) -> FloatArray:
+    """Radius about a fix, m, that holds the truth with the probability PROTECTED; of horizontal covariances
+    (..., 2, 2), m2, by their longer axis."""
+    longest = np.linalg.eigvalsh(covariance_m2)[..., -1]
+    return np.asarray(measured().errors.radius(PROTECTED) * np.sqrt(longest), dtype=np.float64)

@@ -17,7 +17,7 @@ from buildloc_matcher.acceptance import (
     refuse_refined,
     score,
 )
-from buildloc_matcher.calibration import Tail, measured, threshold
+from buildloc_matcher.calibration import PROTECTED, Errors, Tail, measured, protection_level_m, threshold
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.geometry import Similarity
 from buildloc_matcher.refinement import Refined
@@ -111,7 +111,17 @@ def test_the_threshold_follows_from_the_rate_asked_for() -> None:
     assert tail.quantile(0.1) == pytest.approx(4.0) == tail.quantile(0.5)  # nothing was fitted below
     for rate in (1e-2, 1e-6):
         assert tail.exceedance(tail.quantile(rate)) == pytest.approx(rate)
-    assert threshold(1e-6) > threshold(1e-5) > measured().start_nats
+    assert threshold(1e-6) > threshold(1e-5) > measured().tail.start_nats
+
+
+def test_errors_with_a_heavy_tail_are_protected_against_further_out() -> None:
+    normal, heavy = Errors(1.0, 1e6), Errors(1.0, 8.0)
+    assert normal.radius(PROTECTED) == pytest.approx(3.717, abs=1e-3)  # root of chi-square's 13.82
+    assert heavy.radius(PROTECTED) == pytest.approx(6.08, abs=0.01)  # root of twice the 18.49 of F(2, 8)
+    north = np.diag([1.0, 4.0])
+    turned = np.array([[2.5, 1.5], [1.5, 2.5]])  # the same, by 45 degrees
+    both = protection_level_m(np.stack([north, turned]))
+    assert both == pytest.approx(2.0 * measured().errors.radius(PROTECTED))
 
 
 def test_each_figure_of_the_refinement_that_falls_short_is_named() -> None:

@@ -1,4 +1,5 @@
-"""What acceptance is calibrated on: how high wrong candidates score, bounded, of the worst kind of ground."""
+"""What is calibrated: how high wrong candidates of the controls score, bounded, of the worst kind of ground;
+and how far errors of the flights' fixes go beyond their covariance."""
 
 from __future__ import annotations
 
@@ -9,18 +10,19 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from buildloc_matcher.calibration import Tail
+from buildloc_matcher.calibration import PROTECTED, Errors, Tail
 from buildloc_msgs_py.errors import BuildlocError
 from buildloc_msgs_py.types import FloatArray
-from scipy.stats import beta, chi2
+from scipy.stats import beta, chi2, lomax
 
 from buildloc_eval.integrity.plan import CALIBRATION
-from buildloc_eval.integrity.scoring import wrong_best
+from buildloc_eval.integrity.scoring import consistent, wrong_best
 
 START_NATS = 5.0  # the tail begins here: most wrong candidates score less, and say nothing of the highest
 BOUND = 0.95
 FEWEST_ABOVE = 20  # scores of a kind above the start for a scale of its own
 AT_RATE = 1e-4  # where the kinds are compared
+FEWEST_FIXES = 200  # for a tail of their errors
 
 
 def fit_tail(scores: FloatArray, other_scale_nats: float = math.nan) -> Tail:
@@ -35,12 +37,23 @@ def fit_tail(scores: FloatArray, other_scale_nats: float = math.nan) -> Tail:
     return Tail(START_NATS, share, scale)
 
 
-def calibrate(records: pd.DataFrame) -> dict[str, Any]:
-    """The tails of all kinds of trials and the one to be used: where the score for AT_RATE is highest.
+def fit_errors(nees: FloatArray) -> Errors:
+    """Student's t in the plane that is likeliest for normalised errors squared (N,) of fixes, which follow
+    Lomax's distribution then. Raises BuildlocError for fewer than FEWEST_FIXES."""
+    if len(nees) < FEWEST_FIXES:
+        count = f"{len(nees)} of {FEWEST_FIXES}"
+        raise BuildlocError(f"too few fixes ({count}) to calibrate their errors on; ask for more --trials")
+    half_dof, _, spread = lomax.fit(nees, floc=0.0)
+    return Errors(math.sqrt(spread / (2.0 * half_dof)), 2.0 * half_dof)
 
-    Raises BuildlocError with too few wrong candidates.
+
+def calibrate(records: pd.DataFrame) -> dict[str, Any]:
+    """The tails of all kinds of controls and the one to be used: where the score for AT_RATE is highest. And
+    the distribution of the errors of the flights' fixes.
+
+    Raises BuildlocError with too few wrong candidates or fixes.
     """
-    wrong = wrong_best(records)
+    wrong = wrong_best(records[records.control])
     pooled = fit_tail(wrong.score.to_numpy())
     if math.isnan(pooled.scale_nats):
         raise BuildlocError("too few wrong candidates to calibrate acceptance on; ask for more --trials")
@@ -56,7 +69,11 @@ def calibrate(records: pd.DataFrame) -> dict[str, Any]:
         }
         for kind, tail in tails.items()
     }
-    return {"trials": len(records), "kinds": kinds, "worst": worst, "tail": asdict(tails[worst])}
+    right = consistent(records)
+    return {
+        "trials": len(records), "kinds": kinds, "worst": worst, "tail": asdict(tails[worst]),
+        "fixes": len(right), "errors": asdict(fit_errors(right.nees.to_numpy())),
+    }  # fmt: skip
 
 
 def write_calibration(path: Path, records: pd.DataFrame, plan: str, seed: int) -> str:
@@ -69,5 +86,7 @@ def write_calibration(path: Path, records: pd.DataFrame, plan: str, seed: int) -
     command = f"buildloc eval integrity --plan {plan} --trials {len(records)} --seed {seed}"
     kept = {"made by": f"{command} --write-calibration FILE", **found}
     path.write_text(json.dumps(kept, indent=2) + "\n")
-    tail = Tail(**found["tail"])
-    return f"{path}: score {tail.quantile(AT_RATE):.1f} nats for a rate of {AT_RATE:g} ({found['worst']})"
+    tail, errors = Tail(**found["tail"]), Errors(**found["errors"])
+    score = f"score {tail.quantile(AT_RATE):.1f} nats for a rate of {AT_RATE:g} ({found['worst']})"
+    within = f"{errors.radius(PROTECTED):.2f} standard deviations ({PROTECTED:.1%})"
+    return f"{path}: {score}; errors of {found['fixes']} fixes stay within {within}"

@@ -121,7 +121,7 @@ def _tokyo(side: str, half: Box) -> tuple[Place, ...]:
 
 CALIBRATION = Plan(
     "calibration",
-    1,  # what acceptance is calibrated on are wrong candidates
+    2,  # acceptance is calibrated on wrong candidates, which controls have, and covariances on flights
     (_boston("Framingham", FRAMINGHAM), *_tokyo("west", TOKYO_WEST)),
     {
         BOSTON: Territory((ALL_BOSTON,), tuple(Circle(*centre, BOSTON_KM[-1] + GAP_KM) for centre in TESTED)),

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from buildloc_matcher.calibration import protection_level_m
 from buildloc_msgs_py.types import FloatArray
 from numpy.typing import NDArray
 from scipy.stats import binomtest, chi2
 
 CORRECT_M = 100.0
 CONFIDENCE = 0.95
-PROTECTED = 0.999
 SHARES_CHECKED = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001, 1e-4, 1e-5)
 SCORE_BINS = (-math.inf, -20.0, -10.0, -5.0, -2.0, 0.0, 2.0, 5.0, 10.0, 20.0, math.inf)
 Mask = NDArray[np.bool_]
@@ -150,18 +150,17 @@ def nees_row(some: pd.DataFrame) -> dict[str, Any]:
         "within 95 % bound": share(int((nees <= chi2.ppf(0.95, 2)).sum()), len(some)),
         "mean": float(nees.mean()) if len(some) else None,
         "within protection level": share(
-            int((some.fix_error_m.to_numpy() <= protection_level_m(some)).sum()), len(some)
+            int((some.fix_error_m.to_numpy() <= protection_levels_m(some)).sum()), len(some)
         ),
-        "median protection level_m": float(np.median(protection_level_m(some))) if len(some) else None,
+        "median protection level_m": float(np.median(protection_levels_m(some))) if len(some) else None,
     }
 
 
-def protection_level_m(some: pd.DataFrame) -> FloatArray:
-    """(N,) radius that the error exceeds once in a thousand at most, if the covariance is true: by its longer
-    axis."""
-    east, north, cross = some.var_east_m2, some.var_north_m2, some.cov_east_north_m2
-    longest = (east + north) / 2.0 + np.hypot((east - north) / 2.0, cross)
-    return np.asarray(np.sqrt(chi2.ppf(PROTECTED, 2) * longest), dtype=np.float64)
+def protection_levels_m(some: pd.DataFrame) -> FloatArray:
+    """(N,) what the matcher says that the errors of some fixes stay within."""
+    cross = some.cov_east_north_m2
+    rows = np.array([[some.var_east_m2, cross], [cross, some.var_north_m2]])
+    return protection_level_m(rows.transpose(2, 0, 1))
 
 
 def consistency(records: pd.DataFrame) -> list[dict[str, Any]]:
