@@ -242,14 +242,31 @@ def test_a_flight_that_goes_on_over_other_ground_than_the_reference_has_is_contr
     assert "the match ends before the flight: the reference has not what was seen" in answer.result.reason
 
 
-def test_the_end_of_a_flight_must_not_fit_better_near_by() -> None:
-    """The path of the mapper slips by 15 m before the last eight keyframes: most of the window lies right,
-    and what the latest frames saw lies 15 m beside where they put it."""
+@pytest.mark.parametrize("frames", [4, 8])
+def test_the_end_of_a_flight_must_not_fit_better_near_by(frames: int) -> None:
+    """The path of the mapper slips by 15 m before the last keyframes: most of the window lies right, and what
+    the latest frames saw lies 15 m beside where they put it."""
     seen_map, poses, seen, *_ = flight(1)
-    slipped = [k if k.stamp_ns <= 17 * SECOND else replace(k, y_m=k.y_m + 15.0) for k in poses]
+    right = (25 - frames) * SECOND
+    slipped = [k if k.stamp_ns <= right else replace(k, y_m=k.y_m + 15.0) for k in poses]
     answer = Matcher(HERE, DEFAULT).fix(seen_map, slipped, seen)
     assert isinstance(answer.result, NoFix)
     assert "the latest frames fit elsewhere: lead -" in answer.result.reason
+
+
+def test_the_end_of_a_flight_must_fit_by_itself() -> None:
+    """Of what the latest frames saw most is nowhere in the reference, and lies nowhere near by better."""
+    seen_map, poses, seen, *_ = flight(1)
+    rng = np.random.default_rng(1)
+    mixed = [
+        one if one.stamp_ns <= 17 * SECOND else replace(
+            one, centroids_m=np.concatenate([one.centroids_m[::4], rng.uniform(-80.0, 80.0, (20, 2))])
+        )
+        for one in seen
+    ]  # fmt: skip
+    answer = Matcher(HERE, DEFAULT).fix(seen_map, poses, mixed)
+    assert isinstance(answer.result, NoFix)
+    assert "the latest frames fit loosely: -" in answer.result.reason
 
 
 def test_only_rivals_have_to_be_led() -> None:
