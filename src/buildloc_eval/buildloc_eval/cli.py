@@ -189,12 +189,12 @@ def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("eval integrity")
     group.add_argument(
         "--plan", choices=["test", "calibration"],
-        help="ground and seeds: the test's (default), or those that acceptance is calibrated on",
+        help="ground and seeds: the test's (default), or those of the calibration",
     )  # fmt: skip
     group.add_argument("--trials", type=_count, metavar="N", help="how many (default: 30000, quick: 400)")
     group.add_argument(
         "--write-calibration", type=Path, metavar="FILE",
-        help="fit acceptance to the calibration's trials, write it here",
+        help="fit acceptance and protection levels to the calibration's trials, write them here",
     )  # fmt: skip
     group = parser.add_argument_group("eval segmentation")
     group.add_argument(

@@ -39,7 +39,7 @@ from buildloc_eval.integrity.plan import (
 from buildloc_eval.integrity.report import report_of, write
 from buildloc_eval.integrity.trials import attempt, other_city, run
 from buildloc_eval.paper.store import StaleError
-from buildloc_matcher.calibration import protection_level_m
+from buildloc_matcher.calibration import PROTECTED, measured
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.reference.buildings import Buildings, concatenate
 from buildloc_matcher.reference.database import MANIFEST, DatabaseError
@@ -265,14 +265,6 @@ def test_the_report_is_made_of_the_trials(records: pd.DataFrame, tmp_path: Path)
     assert "two invented towns" in said and "false" in said
 
 
-def test_a_calibration_is_reported_without_flights(records: pd.DataFrame, tmp_path: Path) -> None:
-    controls = records[records.control]
-    write(tmp_path, report_of(controls, CALIBRATION, 30_000, 1), controls)
-    kept = json.loads((tmp_path / "report.json").read_text())
-    assert kept["bars"][1]["reached"]["share"] is None and kept["bars"][1]["met"] == "-"
-    assert (tmp_path / "report.html").read_text().count("data:image/png;base64,") == 1
-
-
 def test_shares_have_exact_intervals_and_nothing_has_the_rule_of_three() -> None:
     assert scoring.share(0, 300) == {"share": 0.0, "of": 300, "95%": [0.0, 0.01]}
     half = scoring.share(5, 10)
@@ -317,10 +309,11 @@ def test_the_curve_trades_availability_for_false_fixes() -> None:
 
 
 def test_consistency_counts_errors_within_their_bounds() -> None:
-    row = scoring.consistency(made_up())[0]  # of the one right fix
+    turned = {"var_east_m2": 2.5, "var_north_m2": 2.5, "cov_east_north_m2": 1.5}  # axes of 2 and 1 m
+    row = scoring.consistency(made_up(**turned))[0]  # of the one right fix
     assert row["fixes"] == 1 and row["within 95 % bound"]["share"] == 1.0
-    longer_axis = np.diag([4.0, 4.0])
-    assert row["median protection level_m"] == pytest.approx(protection_level_m(longer_axis))
+    radius = measured().errors.radius(PROTECTED)
+    assert row["median protection level_m"] == pytest.approx(2.0 * radius)
     reliability = scoring.tail_reliability(made_up())
     assert reliability[0]["observed"] == scoring.share(2, 2)  # trials 2 and 4 have a wrong best candidate
     assert reliability[-1] == {"claimed": 1e-5, "observed": scoring.share(1, 2)}

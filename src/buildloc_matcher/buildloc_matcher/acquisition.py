@@ -28,8 +28,8 @@ from buildloc_matcher.window import frames_kept, newest
 
 @dataclass(frozen=True)
 class Acquired:
-    """The place of a flight's last keyframe, the latest agreement on the way there, and the figures behind
-    the first."""
+    """The place of a flight's last keyframe, the latest agreement on the way there, and the figures of the
+    piece of the flight where the reference agreed first."""
 
     place: Place
     agreement: Agreement
@@ -38,7 +38,7 @@ class Acquired:
 
 @dataclass(frozen=True)
 class NotAcquired:
-    """Why no piece of the flight gave a place, and the figures of the last piece."""
+    """Why no piece of the flight gave a place, and the figures of the whole flight, which was asked first."""
 
     reason: str
     figures: dict[str, float]
@@ -115,11 +115,12 @@ def _agree(
     # A match may leave the true houses for others on its way, and the window bends along: its end has to fit
     # by itself, and nowhere near by better.
     near = np.diag(np.square([RIVAL_M / SIGMAS, RIVAL_M / SIGMAS, 1.0]))
-    for frames in (config.follow_frames, 2 * config.follow_frames):
-        latest = seen_in_world(refined.poses, observations, frames)
-        at_end = ask(latest, np.zeros(2), near, reference, config)
-        if at_end.lead < 0.0:
-            better = f"lead {at_end.lead:.1f} nats over another place near by, for {len(latest)} buildings"
+    last, latest = (seen_in_world(refined.poses, observations, n * config.follow_frames) for n in (1, 2))
+    at_last, at_end = (ask(some, np.zeros(2), near, reference, config) for some in (last, latest))
+    figures |= {"end_nats": at_end.nats, "end_lead": at_end.lead, "end_buildings": len(latest)}
+    for opinion, some in ((at_last, last), (at_end, latest)):
+        if opinion.lead < 0.0:
+            better = f"lead {opinion.lead:.1f} nats over another place near by, for {len(some)} buildings"
             return _Refusal(f"undecided: the latest frames fit elsewhere: {better}"), figures
     if (told := _loose(at_end, len(latest), config)) is not None:
         return _Refusal(f"undecided: the latest frames fit loosely: {told}"), figures

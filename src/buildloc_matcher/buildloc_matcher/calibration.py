@@ -40,15 +40,15 @@ class Tail:
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of fixes over their standard deviations follow Student's t in the plane: times ``scale``, with
-    ``dof`` degrees of freedom; the fewer, the heavier the tail."""
+    """Errors of fixes over their standard deviations (by the whole horizontal covariance) follow Student's t
+    in the plane, times ``scale``, with ``dof`` degrees of freedom: the fewer, the heavier the tail."""
 
     scale: float
     dof: float
 
     def radius(self, probability: float) -> float:
-        """Standard deviations that the error stays within with this probability."""
-        return self.scale * math.sqrt(self.dof * ((1.0 - probability) ** (-2.0 / self.dof) - 1.0))
+        """Standard deviations that the error stays within with this probability, below 1."""
+        return self.scale * math.sqrt(self.dof * math.expm1(-2.0 / self.dof * math.log1p(-probability)))
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,8 @@ def threshold(rate: float) -> float:
 
 
 def protection_level_m(covariance_m2: FloatArray) -> FloatArray:
-    """Radius about a fix, m, that holds the truth with the probability PROTECTED; of horizontal covariances
-    (..., 2, 2), m2, by their longer axis."""
+    """Radius about a fix, m, that holds the truth with the probability PROTECTED, of horizontal covariances
+    (..., 2, 2), m2, by their longer axis; if the fix is not of another place altogether, and
+    ``sigma_registration_m`` is right."""
     longest = np.linalg.eigvalsh(covariance_m2)[..., -1]
     return np.asarray(measured().errors.radius(PROTECTED) * np.sqrt(longest), dtype=np.float64)

@@ -114,7 +114,8 @@ class MatcherConfig:
     )
     min_recent_nats: float = param(
         0.5,
-        "smallest evidence of a first fix, and lead over places near by, nats per recent frames' building",
+        "smallest evidence of a first fix, and lead over places near by, of the recent and of the latest "
+        "frames, nats per building",
         0.0,
         1e3,
     )

@@ -1,4 +1,5 @@
-"""Does the reference agree where a pursuit says that the drone is? A sequential test, by evidence in nats.
+"""Does the reference agree where a pursuit says that the drone is? A sequential test, by evidence in nats, of
+the place that the latest frames are refined to.
 
 The buildings of the latest frames speak for the predicted place or against it (log-likelihood ratios against
 chance, :mod:`evidence`). Much for it: agreement. Much against every place that the prediction's uncertainty

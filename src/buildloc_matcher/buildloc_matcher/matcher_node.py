@@ -25,7 +25,6 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image, NavSatFix, PointCloud2
 from std_msgs.msg import Empty, String
 
-from buildloc_matcher.calibration import protection_level_m
 from buildloc_matcher.config import DEFAULT, MatcherConfig, check_matcher, preset_values
 from buildloc_matcher.matcher import Answer
 from buildloc_matcher.pace import Pace
@@ -43,8 +42,7 @@ class MatcherNode(Node):  # type: ignore[misc]
         self.session = Session(check_matcher(declare_config(self, MatcherConfig, preset)))
         self.diagnostics = Diagnostics(self)
         self._worker = Worker(self, "solve")
-        self._solving = False
-        self._sent: Fix | None = None  # the latest fix since the last tick
+        self._solving = self._fixed = False
         self._next: Job | None = None
         self._answered = self._fixes = self._withdrawals = 0
         self._pace = Pace()
@@ -84,7 +82,7 @@ class MatcherNode(Node):  # type: ignore[misc]
         self._give(self.session.locate(wire.decode_tracked(message)))
 
     def _on_reset(self, message: Empty) -> None:
-        self._next = self._sent = None
+        self._next, self._fixed = None, False
         self.session.reset()
         self._pace.reset()
 
@@ -130,34 +128,27 @@ class MatcherNode(Node):  # type: ignore[misc]
             self._withdrawals = seeker.withdrawals
             self._fix.publish(encode.encode_fix(self.session.waiting()))
         if isinstance(result, Fix) and seeker.fresh(result):
-            self._sent, self._fixes = result, self._fixes + 1
+            self._fixed, self._fixes = True, self._fixes + 1
             self._fix.publish(encode.encode_fix(result))
             self._pose.publish(encode.encode_pose(result))
             late_ns = self.get_clock().now().nanoseconds - result.stamp_ns
             self._pace.add(time.monotonic(), 1e-9 * late_ns)
 
     def _on_tick(self) -> None:
-        sent, self._sent = self._sent, None
-        if sent is None:
+        if not self._fixed:
             self._fix.publish(encode.encode_fix(self.session.waiting()))
         level = DiagnosticStatus.OK if self.session.seeker is not None else DiagnosticStatus.ERROR
         self.diagnostics.report(
-            level, "fix" if sent is not None else f"no fix: {self.session.waiting().reason}",
+            level, "fix" if self._fixed else f"no fix: {self.session.waiting().reason}",
             maps_answered=self._answered, fixes=self._fixes, **self.session.figures(),
-            **self._pace.figures(), **_protection(sent), **self._funnel,
+            **self._pace.figures(), **self._funnel,
         )  # fmt: skip
+        self._fixed = False
 
     def destroy_node(self) -> None:
         """Let the running solve end first."""
         self._worker.shutdown()
         super().destroy_node()
-
-
-def _protection(fix: Fix | None) -> dict[str, float]:
-    """For /diagnostics: what the error of a fix stays within, in all but one case of a thousand."""
-    if fix is None:
-        return {}
-    return {"protection_level_m": float(protection_level_m(fix.covariance_enu_m2[:2, :2]))}
 
 
 def main() -> int:

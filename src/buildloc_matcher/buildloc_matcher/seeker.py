@@ -16,6 +16,7 @@ import numpy as np
 from buildloc_msgs_py.types import Fix, FloatArray, FrameObservation, Keyframe, LocalMap, NoFix, Tracked
 
 from buildloc_matcher.acceptance import Outcome
+from buildloc_matcher.calibration import protection_level_m
 from buildloc_matcher.geometry import wrap
 from buildloc_matcher.matcher import Answer, Matcher
 from buildloc_matcher.pursuit import (
@@ -53,7 +54,7 @@ class Seeker:
         with self._lock:
             self.pursuit = Pursuit()
             self._flight = object()
-            self._fixed_ns = -1
+            self._latest: Fix | None = None  # of those given out
             self._unchecked = 0  # maps since the last global search
             self.reason = WAITING
 
@@ -75,11 +76,15 @@ class Seeker:
             return NoFix(tracked.stamp_ns, place)
 
     def figures(self) -> dict[str, object]:
-        """For /diagnostics: the mode, metres flown since the reference agreed, and what was given up."""
-        pursuit = self.pursuit
+        """For /diagnostics: the mode, metres flown since the reference agreed, the protection level of the
+        latest fix that was given out (NaN without a place), and what was given up."""
+        pursuit, latest, level = self.pursuit, self._latest, math.nan
+        if latest is not None and pursuit.mode is not Mode.ACQUIRE:
+            level = float(protection_level_m(latest.covariance_enu_m2[:2, :2]))
         return {
             "mode": pursuit.mode.value,
             "since_agreement_m": pursuit.since_agreement_m,
+            "protection_level_m": level,
             "withdrawals": self.withdrawals,
             "withdrawn": pursuit.withdrawn,
         }
@@ -87,8 +92,8 @@ class Seeker:
     def fresh(self, fix: Fix) -> bool:
         """Whether a fix is later than all that were given out; it counts as given out then."""
         with self._lock:
-            later = fix.stamp_ns > self._fixed_ns
-            self._fixed_ns = max(self._fixed_ns, fix.stamp_ns)
+            later = self._latest is None or fix.stamp_ns > self._latest.stamp_ns
+            self._latest = fix if later else self._latest
             return later
 
     def solve(

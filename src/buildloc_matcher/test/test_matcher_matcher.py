@@ -252,6 +252,7 @@ def test_the_end_of_a_flight_must_not_fit_better_near_by(frames: int) -> None:
     answer = Matcher(HERE, DEFAULT).fix(seen_map, slipped, seen)
     assert isinstance(answer.result, NoFix)
     assert "the latest frames fit elsewhere: lead -" in answer.result.reason
+    assert {"end_nats", "end_lead", "end_buildings"} <= answer.funnel.keys()
 
 
 def test_the_end_of_a_flight_must_fit_by_itself() -> None:

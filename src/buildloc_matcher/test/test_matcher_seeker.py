@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from buildloc_matcher.acceptance import Outcome
+from buildloc_matcher.calibration import PROTECTED, measured
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.follow import Followed, Opinion
 from buildloc_matcher.geometry import Similarity
@@ -185,6 +186,17 @@ def test_a_fix_older_than_one_that_is_out_is_not_fresh(matcher: Scripted, seeker
     assert [seeker.fresh(fix) for fix in (second, first, second)] == [True, False, False]
     seeker.reset()
     assert seeker.fresh(first)
+
+
+def test_the_protection_level_is_that_of_the_fix_that_is_out(matcher: Scripted, seeker: Seeker) -> None:
+    assert math.isnan(seeker.figures()["protection_level_m"])  # type: ignore[arg-type]
+    matcher.places += [(500.0, 700.0), None]
+    matcher.outcomes.append(Outcome.REJECTED)
+    found = at_keyframe(seeker, 2)
+    assert isinstance(found, Fix) and seeker.fresh(found)
+    assert seeker.figures()["protection_level_m"] == pytest.approx(measured().errors.radius(PROTECTED))
+    at_keyframe(seeker, 3)
+    assert seeker.withdrawals == 1 and math.isnan(seeker.figures()["protection_level_m"])  # type: ignore[arg-type]
 
 
 def test_a_reset_forgets_the_flight_even_while_it_is_solved(matcher: Scripted, seeker: Seeker) -> None:

@@ -24,7 +24,7 @@ def evaluate(
     out: Path, plan_name: str, trials: int | None, seed: int, quick: bool, say: Say, calibration: Path | None
 ) -> str:
     """Run what is not there yet, write report.json and report.html; the summary. ``trials``: how many,
-    instead of the plan's. ``calibration``: the file to write what acceptance is calibrated by.
+    instead of the plan's. ``calibration``: the file to write what the matcher is calibrated by.
 
     Raises StaleError when the folder holds results of another configuration or code.
     """

@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.stats import chi2
 
-from buildloc_eval.integrity.scoring import consistent, flights, is_false, protection_levels_m, share
+from buildloc_eval.integrity.scoring import consistent, flights, is_false, share, told_protection_m
 
 Picture = tuple[str, Path]
 Rows = Sequence[dict[str, Any]]
@@ -121,7 +121,7 @@ def draw_consistency(out: Path, records: pd.DataFrame) -> Picture:
 def draw_protection(out: Path, records: pd.DataFrame) -> Picture:
     """Stanford plot: errors above the diagonal are misleading."""
     some = consistent(records)
-    level, error = protection_levels_m(some), some.fix_error_m.to_numpy()
+    level, error = told_protection_m(some), some.fix_error_m.to_numpy()
     most = max(30.0, float(np.quantile(level, 0.999)) if len(level) else 0.0)
     figure, axes = plt.subplots(figsize=(6, 5.5))
     axes.plot(np.minimum(error, most), np.minimum(level, most), ".", markersize=3)

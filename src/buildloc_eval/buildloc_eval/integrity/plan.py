@@ -11,7 +11,7 @@ from buildloc_matcher.reference.region import Box, Circle, Region
 from buildloc_msgs_py.types import FloatArray
 from numpy.typing import NDArray
 
-FLIGHT = "flight"  # over ground that the reference holds as it is: four of five trials
+FLIGHT = "flight"  # over ground that the reference holds as it is
 CONTROLS = (
     "outside", "another city", "mirrored", "missing", "shifted", "grid suburbs", "snow", "scaled",
 )  # fmt: skip
@@ -121,7 +121,7 @@ def _tokyo(side: str, half: Box) -> tuple[Place, ...]:
 
 CALIBRATION = Plan(
     "calibration",
-    2,  # acceptance is calibrated on wrong candidates, which controls have, and covariances on flights
+    2,  # acceptance is calibrated on the wrong candidates of controls, protection levels on flights
     (_boston("Framingham", FRAMINGHAM), *_tokyo("west", TOKYO_WEST)),
     {
         BOSTON: Territory((ALL_BOSTON,), tuple(Circle(*centre, BOSTON_KM[-1] + GAP_KM) for centre in TESTED)),

@@ -69,25 +69,21 @@ def write(out: Path, report: dict[str, Any], records: pd.DataFrame) -> str:
     """Write both files; the summary."""
     out.mkdir(parents=True, exist_ok=True)
     (out / "report.json").write_text(json.dumps(_plain(report), indent=1, allow_nan=False) + "\n")
+    curves = {
+        "ours, all trials": report["curve"],
+        "ours, trials of the paper's": report["curve on the paper's trials"],
+        "paper's argmax, over MNN-Jaccard": report["curve of the paper's argmax, over MNN-Jaccard"],
+    }
     pictures = [
+        figures.draw_curves(out, curves),
+        figures.draw_availability(out, records),
         figures.draw_reliability(
             out, report["probability of a false fix, claimed and observed"],
             report["score as log-odds, claimed and observed"],
-        )
+        ),
+        figures.draw_consistency(out, records),
+        figures.draw_protection(out, records),
     ]  # fmt: skip
-    if not records.control.all():  # a calibration has no flights to be available for
-        curves = {
-            "ours, all trials": report["curve"],
-            "ours, trials of the paper's": report["curve on the paper's trials"],
-            "paper's argmax, over MNN-Jaccard": report["curve of the paper's argmax, over MNN-Jaccard"],
-        }
-        pictures = [
-            figures.draw_curves(out, curves),
-            figures.draw_availability(out, records),
-            *pictures,
-            figures.draw_consistency(out, records),
-            figures.draw_protection(out, records),
-        ]
     shown = {name: value for name, value in report.items() if "curve" not in name}
     write_report(out / "report.html", "Integrity: fixes that can be trusted", shown, pictures)
     return summary(report)

@@ -150,13 +150,13 @@ def nees_row(some: pd.DataFrame) -> dict[str, Any]:
         "within 95 % bound": share(int((nees <= chi2.ppf(0.95, 2)).sum()), len(some)),
         "mean": float(nees.mean()) if len(some) else None,
         "within protection level": share(
-            int((some.fix_error_m.to_numpy() <= protection_levels_m(some)).sum()), len(some)
+            int((some.fix_error_m.to_numpy() <= told_protection_m(some)).sum()), len(some)
         ),
-        "median protection level_m": float(np.median(protection_levels_m(some))) if len(some) else None,
+        "median protection level_m": float(np.median(told_protection_m(some))) if len(some) else None,
     }
 
 
-def protection_levels_m(some: pd.DataFrame) -> FloatArray:
+def told_protection_m(some: pd.DataFrame) -> FloatArray:
     """(N,) what the matcher says that the errors of some fixes stay within."""
     cross = some.cov_east_north_m2
     rows = np.array([[some.var_east_m2, cross], [cross, some.var_north_m2]])
