@@ -27,6 +27,9 @@ COPY src src
 RUN source /opt/ros/jazzy/setup.bash \
  && /opt/buildloc/bin/python -m colcon build --base-paths src --merge-install
 
+# What is compiled is kept there: the user must own it, as a volume too.
+RUN install -d -o 1000 -g 1000 /home/ubuntu/.cache
+
 ENV PATH=/opt/buildloc/bin:/buildloc/install/lib/buildloc:$PATH
 USER 1000
 WORKDIR /home/ubuntu

@@ -396,13 +396,14 @@ def _replay(args: argparse.Namespace) -> int:
     from buildloc_msgs_py.types import Fix
 
     from buildloc.records import read_fixes
-    from buildloc.settings import NODES, REFERENCE_DB, matcher_config_of
+    from buildloc.settings import NODES, REFERENCE_DB, check_settings, matcher_config_of
     from buildloc.supervisor import dds_environment
 
     os.environ.update(dds_environment())
     from buildloc.replay import replay
 
     settings = _settings(args)
+    check_settings(settings)
     if args.database is not None:
         # The node would stay up without a reference; at a desk that is a replay for nothing.
         open_database(args.database, matcher_config_of(settings, REFERENCE_DB))
@@ -429,10 +430,11 @@ def _replay(args: argparse.Namespace) -> int:
 
 
 def _launch(args: argparse.Namespace) -> int:
-    from buildloc.settings import REFERENCE_DB
+    from buildloc.settings import REFERENCE_DB, check_settings
     from buildloc.supervisor import Supervisor, supervise
 
     settings = _settings(args)
+    check_settings(settings)
     if args.database is not None:
         settings[REFERENCE_DB]["database"] = str(args.database.resolve())
     with tempfile.TemporaryDirectory(prefix="buildloc-") as folder:

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
+from buildloc_mapper.config import MapperConfig
 from buildloc_matcher.config import MatcherConfig, matcher_config
 from buildloc_msgs_py.config import ConfigError, from_mapping
+from buildloc_segmenter.config import SegmenterConfig
 
 ConfigT = TypeVar("ConfigT")
 Settings = dict[str, dict[str, Any]]
@@ -65,6 +67,15 @@ def config_of(settings: Settings, node: str, cls: type[ConfigT]) -> ConfigT:
 def matcher_config_of(settings: Settings, node: str = MATCHER) -> MatcherConfig:
     """The config of a node of the matcher, over the preset it names; raises ConfigError."""
     return matcher_config({k: v for k, v in settings[node].items() if k not in NOT_CONFIG})
+
+
+def check_settings(settings: Settings) -> None:
+    """Raises ConfigError for a parameter that its node does not have, or not with such a value: a node itself
+    ignores a name that it does not know."""
+    config_of(settings, SEGMENTER, SegmenterConfig)
+    config_of(settings, MAPPER, MapperConfig)
+    for node in (MATCHER, REFERENCE_DB):
+        matcher_config_of(settings, node)
 
 
 def dump(settings: Settings, path: Path) -> None:

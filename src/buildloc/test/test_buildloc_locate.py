@@ -338,6 +338,22 @@ def test_unknown_presets_and_parameters(
         assert ended.value.code == 2 and options[0] in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("override", "text"),
+    [
+        ("matcher_node.min_jacard=0.5", "parameter min_jacard is unknown to MatcherConfig"),
+        ("mapper_node.map_gsd=0.5", "parameter map_gsd is unknown to MapperConfig"),
+        ("segmenter_node.thread=1", "parameter thread is unknown to SegmenterConfig"),
+        ("reference_db_node.databse=x", "parameter databse is unknown to MatcherConfig"),
+    ],
+)
+def test_nodes_are_not_started_with_a_parameter_that_they_do_not_have(
+    override: str, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert text in refused(capsys, "launch", "--set", override)
+    assert text in refused(capsys, "replay", tmp_path / "bag", "--set", override)
+
+
 def test_another_minimum_area_needs_another_database(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

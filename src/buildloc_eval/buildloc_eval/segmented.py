@@ -33,7 +33,7 @@ class Finds:
 
 
 def connected(mask: ByteArray) -> Labels:
-    """The components of a mask (H, W), neighbours across corners connected as in the mapper."""
+    """The components of a mask (H, W), neighbours across corners connected."""
     return np.asarray(cv2.connectedComponents(mask, connectivity=8)[1], dtype=np.int32)
 
 

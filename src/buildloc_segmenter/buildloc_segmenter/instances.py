@@ -19,8 +19,8 @@ LabelImage = NDArray[np.int32]
 # cores, by distance where it does not.
 CORE_INSET_M = 0.6
 MIN_CORE_M2 = 1.0  # smaller ones are noise: a shed of 8 m2 has a core of 2.6 m2
-# The line between touching buildings on the wire. The mapper fuses at 0.25 m per pixel, with neighbours
-# across corners connected: anything narrower than 0.25 m times the root of two would leak there.
+# The line between touching buildings on the wire. The mapper fuses at 0.25 m per pixel: anything narrower
+# than 0.25 m times the root of two, at a slant, would have gaps there.
 GAP_M = 0.4
 GAP_PX = 1.5  # of the image: its own neighbours across corners
 GROUND = 1  # the watershed's mark of what is no building
