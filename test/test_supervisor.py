@@ -86,14 +86,16 @@ def test_a_node_that_dies_ends_the_graph() -> None:
         assert "Traceback" not in said
 
 
-def test_a_parameter_out_of_range_ends_the_graph_and_is_named_once() -> None:
-    with launch("--set", "mapper_node.features=7") as process:
-        _, said = process.communicate(timeout=DEADLINE_S)
-        assert process.returncode == 2
-        assert said.splitlines() == [
-            "error: parameter features = 7 is out of range [50, 20000]",
-            "error: mapper_node ended with status 2; the graph was stopped",
-        ]
+def test_a_node_that_refuses_a_parameter_ends_the_graph_and_names_it_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain_id()))
+    settings = load(overrides=["mapper_node.features=7"])
+    assert supervise(Supervisor(settings, tmp_path), stop_signals=()) == 2
+    assert capfd.readouterr().err.splitlines() == [
+        "error: parameter features = 7 is out of range [50, 20000]",
+        "error: mapper_node ended with status 2; the graph was stopped",
+    ]
 
 
 def module(folder: Path, name: str, *lines: str) -> str:
