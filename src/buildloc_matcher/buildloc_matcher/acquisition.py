@@ -104,7 +104,7 @@ def _agree(
     refused = refuse_refined(refined, config)
     if refused is not None:
         return _Refusal(refused), figures
-    seen = seen_in_world(refined.poses, observations, len(begun.keyframes))
+    seen = seen_in_world(refined.poses, observations, len(begun.keyframes), config)
     offset = refined.position_m - begun.state.poses[-1, :2]
     opinion = ask(seen, offset, begun.covariance, reference, config)
     figures |= {"recent_nats": opinion.nats, "recent_lead": opinion.lead, "recent_buildings": len(seen)}
@@ -115,14 +115,17 @@ def _agree(
     # A match may leave the true houses for others on its way, and the window bends along: its end has to fit
     # by itself, and nowhere near by better.
     near = np.diag(np.square([RIVAL_M / SIGMAS, RIVAL_M / SIGMAS, 1.0]))
-    last, latest = (seen_in_world(refined.poses, observations, n * config.follow_frames) for n in (1, 2))
+    last, latest = (
+        seen_in_world(refined.poses, observations, n * config.follow_frames, config) for n in (1, 2)
+    )
     at_last, at_end = (ask(some, np.zeros(2), near, reference, config) for some in (last, latest))
     figures |= {"end_nats": at_end.nats, "end_lead": at_end.lead, "end_buildings": len(latest)}
     for opinion, some in ((at_last, last), (at_end, latest)):
-        if opinion.lead < 0.0:
+        if opinion.lead < -config.min_recent_nats * len(some):
             better = f"lead {opinion.lead:.1f} nats over another place near by, for {len(some)} buildings"
             return _Refusal(f"undecided: the latest frames fit elsewhere: {better}"), figures
-    if (told := _loose(at_end, len(latest), config)) is not None:
+    # Where the reference has nothing near by, nothing pulls the end aside either.
+    if at_end.lead != 0.0 and (told := _loose(at_end, len(latest), config)) is not None:
         return _Refusal(f"undecided: the latest frames fit loosely: {told}"), figures
     return Agreement(refined.poses, refined.covariance, math.exp(begun.state.log_scales[1])), figures
 

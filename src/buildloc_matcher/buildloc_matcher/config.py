@@ -47,6 +47,9 @@ class MatcherConfig:
     scale_gate: float = param(0.15, "largest deviation of the map-to-world scale from 1", 0.0, 0.9)
     sigma_m: float = param(2.0, "error of a map building against its neighbours, per axis, m", 0.1, 50.0)
     match_share: float = param(0.7, "share of the map's buildings that the reference has", 0.05, 0.99)
+    false_per_km2: float = param(
+        130.0, "buildings that the segmenter invents on a square kilometre, per km2", 0.0, 1e5
+    )
     seen_share: float = param(
         0.5, "share of the reference's observable buildings that the map has at least", 0.05, 0.95
     )
@@ -130,7 +133,11 @@ class MatcherConfig:
         800.0, "distance without an agreement after which a place is withdrawn, m", 1.0, 1e5
     )
     max_track_sigma_m: float = param(
-        15.0, "standard deviation without an agreement at which a place is withdrawn, m", 0.1, 1000.0
+        19.0,
+        "standard deviation without an agreement at which a place is withdrawn, m; 19 m are a "
+        "protection level of 100 m",
+        0.1,
+        1000.0,
     )
     check_keyframes: int = param(
         6, "keyframes from one global search to the next while tracking, which must confirm", 1, 10000

@@ -201,9 +201,12 @@ def _placed_evidence(moved, points, starts, frame, density, sigma, share):  # ty
     return total
 
 
-def placed_evidence(moved_m: FloatArray, reference: Ground, config: MatcherConfig) -> float:
-    """Nats for a map whose buildings lie at (N, 2) in the world."""
-    grid, settings = reference.grid, (config.sigma_m, config.match_share)
+def placed_evidence(
+    moved_m: FloatArray, reference: Ground, config: MatcherConfig, share: float | None = None
+) -> float:
+    """Nats for a map whose buildings lie at (N, 2) in the world, of which the reference has a share
+    (``match_share`` unless given)."""
+    grid, settings = reference.grid, (config.sigma_m, config.match_share if share is None else share)
     where = (grid.points_m, grid.starts, reference.grid.frame, reference.density_per_m2)
     return float(_placed_evidence(moved_m, *where, *settings))
 

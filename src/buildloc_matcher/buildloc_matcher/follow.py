@@ -26,6 +26,7 @@ from buildloc_matcher.window import start
 
 SIGMAS = 3.0  # the uncertainty of a prediction reaches this far
 ONE_BUILDING_M = 6.0  # buildings of two frames nearer than this are the same
+AREA_CELL_M = 10.0
 
 
 @dataclass(frozen=True)
@@ -47,19 +48,50 @@ class Followed:
     agreement: Agreement | None
 
 
+@dataclass(frozen=True)
+class Seen:
+    """``points_m`` (N, 2) of buildings in the world, and the ``area_m2`` of the ground that they were seen
+    on."""
+
+    points_m: FloatArray
+    area_m2: float
+
+    def __len__(self) -> int:
+        return len(self.points_m)
+
+    def share(self, config: MatcherConfig) -> float:
+        """How many of the buildings the reference should have: a segmenter invents some on every square
+        kilometre, and where hardly any are seen, most may be such. Half of ``match_share`` at least."""
+        false = config.false_per_km2 * 1e-6 * self.area_m2
+        return min(config.match_share, max(0.5 * config.match_share, 1.0 - false / max(len(self), 1)))
+
+
 def seen_in_world(
-    poses: Mapping[int, Pose], observations: Sequence[FrameObservation], frames: int
-) -> FloatArray:
-    """(N, 2) the buildings that the last frames saw, each once, where frames with ``poses`` (x, y, yaw in
-    the world) see them; the newest frame's word goes first."""
+    poses: Mapping[int, Pose],
+    observations: Sequence[FrameObservation],
+    frames: int,
+    config: MatcherConfig,
+) -> Seen:
+    """The buildings that the last frames saw, each once, where frames with ``poses`` (x, y, yaw in the world)
+    see them; the newest frame's word goes first."""
     seen = np.empty((0, 2))
-    placed = sorted((o for o in observations if o.stamp_ns in poses), key=lambda o: -o.stamp_ns)
-    for observation in placed[:frames]:
+    placed = sorted((o for o in observations if o.stamp_ns in poses), key=lambda o: -o.stamp_ns)[:frames]
+    for observation in placed:
         x, y, yaw = poses[observation.stamp_ns]
         points = observation.centroids_m @ rotation(yaw).T + (x, y)
         apart = np.linalg.norm(points[:, None] - seen[None], axis=2)
         seen = np.concatenate([seen, points[(apart > ONE_BUILDING_M).all(axis=1)]])
-    return seen
+    path = np.array([poses[o.stamp_ns][:2] for o in placed]).reshape(-1, 2)
+    return Seen(seen, _around_m2(path, config.observable_radius_m))
+
+
+def _around_m2(path_m: FloatArray, radius_m: float) -> float:
+    """Area of the ground within a radius of any place (N, 2), m2, by cells."""
+    line = np.arange(-radius_m, radius_m, AREA_CELL_M) + 0.5 * AREA_CELL_M
+    disc = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    disc = disc[np.linalg.norm(disc, axis=1) <= radius_m]
+    cells = np.floor((path_m[:, None] + disc).reshape(-1, 2) / AREA_CELL_M)
+    return len(np.unique(cells, axis=0)) * AREA_CELL_M**2
 
 
 def _shifts(sigma: float, config: MatcherConfig) -> FloatArray:
@@ -71,22 +103,23 @@ def _shifts(sigma: float, config: MatcherConfig) -> FloatArray:
 
 
 def ask(
-    seen_m: FloatArray, offset_m: FloatArray, covariance: FloatArray, reference: Ground, config: MatcherConfig
+    seen: Seen, offset_m: FloatArray, covariance: FloatArray, reference: Ground, config: MatcherConfig
 ) -> Opinion:
-    """What buildings (N, 2) say of the pose that puts them there, ``offset_m`` (2,) away from the prediction,
+    """What buildings say of the pose that puts them there, ``offset_m`` (2,) away from the prediction,
     whose covariance (3, 3) tells which other places it has to lead."""
     # Where the pose has gone far, so may others have.
     sigma, gate_m = max(sigma_m(covariance), math.hypot(*offset_m) / 2.0), GATE_SIGMAS * config.sigma_m
     shifts = _shifts(sigma, config)
     moves = shifts - offset_m
-    nats = placed_evidence(seen_m, reference, config)
-    others = np.array([placed_evidence(seen_m + move, reference, config) for move in moves])
+    share = seen.share(config)
+    nats = placed_evidence(seen.points_m, reference, config, share)
+    others = np.array([placed_evidence(seen.points_m + move, reference, config, share) for move in moves])
     # Of all places that the prediction leaves open, each as likely beforehand as the prediction has it.
     prior = np.exp(-0.5 * np.sum(shifts**2, axis=1) / (sigma**2 + config.sigma_m**2))
     somewhere = float(logsumexp(others, b=prior / prior.sum()))
     rival = float(others[np.linalg.norm(moves, axis=1) > gate_m].max(initial=-math.inf))
     lead, chances = nats - rival, math.log(max(1.0, (SIGMAS * sigma / gate_m) ** 2))
-    told = f"{len(seen_m)} buildings, {nats:.1f} nats"
+    told = f"{len(seen)} buildings, {nats:.1f} nats"
 
     def opinion(outcome: Outcome, reason: str) -> Opinion:
         return Opinion(outcome, reason, nats, lead)
@@ -121,7 +154,7 @@ def follow(
     frames = config.follow_frames
     if isinstance(refined, Refined):  # else older frames lie where no fit has bent the path to
         frames = min(max(frames, unanswered), config.refine_frames)
-    seen = seen_in_world(poses, observations, frames)
+    seen = seen_in_world(poses, observations, frames, config)
     opinion = ask(seen, offset[:2], covariance, reference, config)
     if opinion.outcome is not Outcome.ACCEPTED:
         return Followed(opinion, None)

@@ -143,7 +143,7 @@ def start(
 
 def frames_kept(config: MatcherConfig) -> int:
     """The most keyframes that a window can need."""
-    return 4 * config.refine_frames
+    return 8 * config.refine_frames
 
 
 def newest(keyframes: Sequence[Keyframe], count: int) -> tuple[Keyframe, ...]:

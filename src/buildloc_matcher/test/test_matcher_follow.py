@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from buildloc_matcher.acceptance import Outcome
-from buildloc_matcher.follow import Followed, ask, seen_in_world
+from buildloc_matcher.follow import Followed, Seen, ask, seen_in_world
 from buildloc_matcher.geometry import Similarity, rotation, wrap
 from buildloc_matcher.matcher import Matcher
 from buildloc_matcher.refinement import registration_covariance
@@ -39,6 +39,11 @@ def frames(seen: Buildings, noise_m: float = 0.5) -> list[FrameObservation]:
         level = level + rng.normal(0.0, noise_m, level.shape)
         observations.append(FrameObservation(keyframe.stamp_ns, level, 100.0))
     return observations
+
+
+def dense(points_m: FloatArray) -> Seen:
+    """Buildings as close as in a town."""
+    return Seen(np.asarray(points_m), 1000.0 * len(points_m))
 
 
 def predicted(east_m: float, north_m: float) -> Similarity:
@@ -95,7 +100,7 @@ def test_a_street_grid_that_fits_next_door_decides_nothing_once_the_next_door_is
     reference = alike(grid.centroids_m)
     middle = grid.centroids_m.mean(axis=0)
     near = grid.centroids_m[np.abs(grid.centroids_m - middle).max(axis=1) < 60.0]
-    here, none = np.asarray(near), np.zeros(2)
+    here, none = dense(near), np.zeros(2)
     assert ask(here, none, SURE, reference, DEFAULT).outcome is Outcome.ACCEPTED
     wide = np.diag([100.0, 100.0, 1e-4])  # 30 m at three sigma: the neighbour is 24 m away
     opinion = ask(here, none, wide, reference, DEFAULT)
@@ -103,21 +108,21 @@ def test_a_street_grid_that_fits_next_door_decides_nothing_once_the_next_door_is
 
 
 def test_a_better_place_within_the_uncertainty_is_a_disagreement() -> None:
-    seen = seen_in_world({k.stamp_ns: _pose(k) for k in KEYFRAMES}, frames(TOWN), 8)
+    seen = seen_in_world({k.stamp_ns: _pose(k) for k in KEYFRAMES}, frames(TOWN), 8, DEFAULT)
     wide, away = np.diag([100.0, 100.0, 1e-4]), np.array([15.0, 0.0])
-    opinion = ask(seen + away, away, wide, MATCHER.database.ground, DEFAULT)
+    opinion = ask(replace(seen, points_m=seen.points_m + away), away, wide, MATCHER.database.ground, DEFAULT)
     assert opinion.outcome is Outcome.REJECTED and "near by fits better" in opinion.reason
 
 
 def test_a_pose_that_went_far_has_to_lead_places_as_far_again() -> None:
     """A start that was sure of itself, and wrong by two houses, is no reason against the right place; but
     places around are asked then that such a start would not have left open."""
-    seen = seen_in_world({k.stamp_ns: _pose(k) for k in KEYFRAMES}, frames(TOWN), 8)
+    seen = seen_in_world({k.stamp_ns: _pose(k) for k in KEYFRAMES}, frames(TOWN), 8, DEFAULT)
     opinion = ask(seen, np.array([40.0, 0.0]), SURE, MATCHER.database.ground, DEFAULT)
     assert opinion.outcome is Outcome.ACCEPTED
     grid = lattice(30, 30, 24.0)
     middle = grid.centroids_m.mean(axis=0)
-    near = np.asarray(grid.centroids_m[np.abs(grid.centroids_m - middle).max(axis=1) < 60.0])
+    near = dense(grid.centroids_m[np.abs(grid.centroids_m - middle).max(axis=1) < 60.0])
     street = alike(grid.centroids_m)
     assert ask(near, np.zeros(2), SURE, street, DEFAULT).outcome is Outcome.ACCEPTED
     assert ask(near, np.array([24.0, 0.0]), SURE, street, DEFAULT).outcome is Outcome.UNDECIDED
@@ -144,6 +149,23 @@ def test_what_several_frames_saw_counts_once_and_only_the_latest_count() -> None
     observations = [FrameObservation(i, level, 100.0) for i in range(4)]
     poses = {i: (20.0 * i, 0.0, 0.0) for i in range(3)}  # the fourth has no place
     # Frames 2 and 1: (50, 0), (30, 5) and (30, 0), which is (30, 5) again, (10, 5).
-    seen = seen_in_world(poses, observations, 2)
-    assert seen.tolist() == [[50.0, 0.0], [30.0, 5.0], [10.0, 5.0]]
-    assert seen_in_world({}, observations, 2).shape == (0, 2)
+    seen = seen_in_world(poses, observations, 2, DEFAULT)
+    assert seen.points_m.tolist() == [[50.0, 0.0], [30.0, 5.0], [10.0, 5.0]]
+    # Two discs, 20 m apart, by cells of 10 m.
+    radius = DEFAULT.observable_radius_m
+    assert seen.area_m2 == pytest.approx(math.pi * radius**2 + 2.0 * radius * 20.0, rel=0.05)
+    nothing = seen_in_world({}, observations, 2, DEFAULT)
+    assert nothing.points_m.shape == (0, 2) and nothing.area_m2 == 0.0
+
+
+def test_where_hardly_any_buildings_are_seen_most_may_be_invented() -> None:
+    """Of 130 on a square kilometre, half of match_share at least is still taken for real."""
+    ten = np.zeros((10, 2))
+    assert Seen(ten, 1e4).share(DEFAULT) == DEFAULT.match_share  # 1000 on a square kilometre
+    assert Seen(ten, 4e4).share(DEFAULT) == pytest.approx(1.0 - 130.0 / 250.0)
+    assert Seen(ten, 2e5).share(DEFAULT) == DEFAULT.match_share / 2.0
+    # Seven sheds along three kilometres that the reference has not are no reason to give a place up.
+    far = Seen(TOWN.centroids_m[:7] + 1e5, 3e5)
+    ground = MATCHER.database.ground
+    assert ask(far, np.zeros(2), SURE, ground, DEFAULT).outcome is Outcome.UNDECIDED
+    assert ask(replace(far, area_m2=1e4), np.zeros(2), SURE, ground, DEFAULT).outcome is Outcome.REJECTED
