@@ -142,7 +142,7 @@ def start(
 
 
 def frames_kept(config: MatcherConfig) -> int:
-    """The most keyframes that a window can need."""
+    """How many keyframes back a match is looked for that the flight can be followed from."""
     return 8 * config.refine_frames
 
 
