@@ -129,16 +129,17 @@ def select(
         return sorted(rigid, key=lambda pair: (-pair[1].jaccard, -pair[0].votes))
     if not ballot.clusters:
         return []
-    best = [cluster.best for cluster in ballot.clusters]
+    rows = [(c, row) for c, cluster in enumerate(ballot.clusters) for row in cluster.seeds]
+    of, best = np.array(rows).T
     seeds, places = corners[voters.stars[best]], voters.places_m[best]
     grown = grow(query, seeds, places, reference, config)
     listed: list[_Listed] = []
     tested: set[int] = set()
     while True:
-        _list(grown, listed, ballot, query, reference, config)
-        first = listed[0].cluster if listed else -1
+        _list(grown, listed, [ballot.clusters[c] for c in of], query, reference, config)
+        first = listed[0].seed if listed else -1
         if first < 0 or first in tested:
-            return [(ballot.clusters[one.cluster], one.score) for one in listed]
+            return [(ballot.clusters[of[one.seed]], one.score) for one in listed]
         tested.add(first)
         moved = shifted(places[first], reference, config)
         corner = np.repeat(seeds[first : first + 1], len(moved), axis=0)
@@ -147,9 +148,9 @@ def select(
 
 @dataclass(frozen=True)
 class _Listed:
-    """A grown match with its full score and the number of its cluster."""
+    """A grown match with its full score and the number of its seed."""
 
-    cluster: int
+    seed: int
     matches: NDArray[np.int64]
     score: Score
 
@@ -157,22 +158,23 @@ class _Listed:
 def _list(
     grown: Sequence[tuple[int, Grown]],
     listed: list[_Listed],
-    ballot: Ballot,
+    clusters: Sequence[Cluster],
     query: QueryMap,
     reference: Ground,
     config: MatcherConfig,
 ) -> None:
-    """Add the best of the matches (by cluster) that are unlike those in the list, scored, best first."""
+    """Add the best of the matches (by the number of their seed) that are unlike those in the list, scored,
+    best first; ``clusters`` are those of the seeds."""
     ranked = sorted(grown, key=lambda found: -found[1].evidence)
     added = 0
-    for c, match in ranked:
+    for seed, match in ranked:
         if added == GROWN_SCORED or match.evidence < ranked[0][1].evidence - NEGLIGIBLE_NATS:
             break
         if any(_same(match.matches, other.matches) for other in listed):
             continue
-        score = score_grown(_start(ballot.clusters[c], query), match, query, reference, config)
+        score = score_grown(_start(clusters[seed], query), match, query, reference, config)
         if all(_apart(score, other.score) > config.mnn_distance_m for other in listed):
-            listed.append(_Listed(c, match.matches, score))
+            listed.append(_Listed(seed, match.matches, score))
             added += 1
     listed.sort(key=lambda one: -one.score.evidence)
 

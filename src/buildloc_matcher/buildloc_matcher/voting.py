@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.hypotheses import Hypotheses
 
+SEEDS = 4  # hypotheses of a cluster that a match may grow from
+
 
 @dataclass(frozen=True)
 class Cluster:
     """A rotation-consistent cluster of one bin: its vote-weighted mean transform, its votes, the number of
-    its members and the row of the hypothesis with the largest vote among them."""
+    its members and the rows of the hypotheses with the largest votes among them, SEEDS at most."""
 
     x_m: float
     y_m: float
@@ -25,7 +27,7 @@ class Cluster:
     scale: float
     votes: float
     members: int
-    best: int
+    seeds: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -59,10 +61,13 @@ def _consistent(yaws, weights, begin, end, tolerance):  # type: ignore[no-untype
 
 @njit(nogil=True, cache=True)
 def _clusters(starts, positions, yaws, scales, weights, tolerance, out):  # type: ignore[no-untyped-def]
-    """Per bin: x, y, yaw, scale, votes, members, best row of its heaviest rotation-consistent set."""
+    """Per bin: x, y, yaw, scale, votes, members of its heaviest rotation-consistent set, and its SEEDS
+    heaviest rows (-1 pads), heaviest first; the first wins ties."""
     for b in range(len(starts) - 1):
         centre = _consistent(yaws, weights, starts[b], starts[b + 1], tolerance)
-        x, y, scale, c, s, votes, members, best = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, -1
+        x, y, scale, c, s, votes, members = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0
+        seeds = out[b, 6:]
+        seeds[:] = -1.0
         for i in range(starts[b], starts[b + 1]):
             if abs((yaws[i] - centre + math.pi) % (2.0 * math.pi) - math.pi) > tolerance:
                 continue
@@ -74,10 +79,14 @@ def _clusters(starts, positions, yaws, scales, weights, tolerance, out):  # type
                 votes + w,
                 members + 1,
             )
-            if best < 0 or w > weights[best]:
-                best = i
+            row = i
+            for k in range(SEEDS):
+                if seeds[k] < 0 or weights[row] > weights[int(seeds[k])]:
+                    row, seeds[k] = int(seeds[k]), row
+                if row < 0:
+                    break
         out[b, 0], out[b, 1], out[b, 2], out[b, 3] = x / votes, y / votes, math.atan2(s, c), scale / votes
-        out[b, 4], out[b, 5], out[b, 6] = votes, members, best
+        out[b, 4], out[b, 5] = votes, members
 
 
 def vote(hypotheses: Hypotheses, config: MatcherConfig) -> Ballot:
@@ -88,7 +97,7 @@ def vote(hypotheses: Hypotheses, config: MatcherConfig) -> Ballot:
     order = np.lexsort((keys[:, 1], keys[:, 0]))
     changes = np.flatnonzero(np.any(np.diff(keys[order], axis=0), axis=1)) + 1
     starts = np.concatenate([[0], changes, [len(order)]])
-    table: NDArray[np.float64] = np.empty((len(starts) - 1, 7))
+    table: NDArray[np.float64] = np.empty((len(starts) - 1, 6 + SEEDS))
     _clusters(
         starts, hypotheses.positions_m[order], hypotheses.yaws_rad[order], hypotheses.scales[order],
         hypotheses.weights[order], math.radians(config.rotation_tolerance_deg), table,
@@ -96,7 +105,7 @@ def vote(hypotheses: Hypotheses, config: MatcherConfig) -> Ballot:
     consistent = table[table[:, 5] >= config.min_votes]
     ranked: FloatArray = consistent[np.lexsort((consistent[:, 1], consistent[:, 0], -consistent[:, 4]))]
     clusters = tuple(
-        Cluster(x, y, yaw, scale, votes, int(members), int(order[int(best)]))
-        for x, y, yaw, scale, votes, members, best in ranked[: config.top_k].tolist()
+        Cluster(x, y, yaw, scale, votes, int(members), tuple(int(order[int(row)]) for row in seeds if row >= 0))
+        for x, y, yaw, scale, votes, members, *seeds in ranked[: config.top_k].tolist()
     )
     return Ballot(clusters, len(table), ranked[:, :2])
