@@ -1,6 +1,6 @@
 """How much the buildings around a hypothesis speak for it: log-likelihood ratios against chance.
 
-A building of the map is seen in the reference with probability ``match_share`` and then lies where the
+A building of the map is in the reference with a probability, its share, and then lies where the
 hypothesis puts it, up to a Gaussian error; else, or if the hypothesis is wrong, the nearest reference
 building is as near as the local density of buildings has it. Nats throughout.
 """
@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 from buildloc_msgs_py.types import FloatArray
 from numba import njit
 from numpy.typing import NDArray
@@ -31,6 +32,8 @@ GATE_SIGMAS = 3.0
 MAX_GATE_M = 16.0
 HOPELESS = -10.0  # a hypothesis that has sunk below this is given up
 NO_MATCH = -1
+FALSE_SIZE_SPREAD, SIZE_BLUR = 0.5, 0.3  # of the logarithm of areas: invented buildings; a size of the map
+LEAST_REAL = 0.1
 FEWEST_AREAS = 4
 MAX_AREA_BIAS = 0.5
 MIN_AREA_SPREAD = 0.3
@@ -71,21 +74,38 @@ def density_at(points_m: FloatArray, reference: Ground) -> FloatArray:
 
 @dataclass(frozen=True)
 class QueryMap:
-    """Buildings of the map (N, 2) metres, their areas (N,), and of each its nearest others (N, NEIGHBOURS),
-    nearest first."""
+    """Buildings of the map (N, 2) metres, their areas (N,), with what probability the reference has each of
+    them (N,), and of each its nearest others (N, NEIGHBOURS), nearest first."""
 
     points_m: FloatArray
     areas_m2: FloatArray
+    shares: FloatArray
     neighbours: NDArray[np.int64]
 
 
-def query_map(points_m: FloatArray, areas_m2: FloatArray) -> QueryMap:
+def shares_of(points_m: FloatArray, areas_m2: FloatArray, config: MatcherConfig) -> FloatArray:
+    """(N,) with what probability the reference has each building of a map: ``match_share`` of those that are
+    none of the segmenter's inventions.
+
+    So many are invented on the ground that was seen, about ``false_area_m2`` large. Where the map has hardly
+    more buildings of a size than that, most of them are invented; in a town of small houses few are.
+    """
+    seen_m2 = shapely.MultiPoint(points_m).buffer(config.observable_radius_m).area
+    sizes = np.log(areas_m2)
+    found = _normal(sizes[:, None] - sizes, SIZE_BLUR).sum(axis=1)
+    spread = math.hypot(FALSE_SIZE_SPREAD, SIZE_BLUR)
+    invented = config.false_per_km2 * 1e-6 * seen_m2 * _normal(sizes - math.log(config.false_area_m2), spread)
+    return np.asarray(config.match_share * np.clip(1.0 - invented / found, LEAST_REAL, 1.0))
+
+
+def query_map(points_m: FloatArray, areas_m2: FloatArray, config: MatcherConfig) -> QueryMap:
     """The map's buildings with their neighbourhoods; N >= 2."""
     count = min(NEIGHBOURS, len(points_m) - 1)
     _, near = cKDTree(points_m).query(points_m, k=count + 1)
     return QueryMap(
-        np.ascontiguousarray(points_m), areas_m2, np.ascontiguousarray(near[:, 1:].astype(np.int64))
-    )
+        np.ascontiguousarray(points_m), areas_m2, shares_of(points_m, areas_m2, config),
+        np.ascontiguousarray(near[:, 1:].astype(np.int64)),
+    )  # fmt: skip
 
 
 def witnesses(points_m: FloatArray, triangles: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -117,7 +137,7 @@ def _gain(squared, variance, gate, density, share):  # type: ignore[no-untyped-d
 
 
 @njit(nogil=True, cache=True)
-def _seed_evidence(query, stars, corners, others, places, points, starts, frame, density, sigma, share, out):  # type: ignore[no-untyped-def]
+def _seed_evidence(query, shares, stars, corners, others, places, points, starts, frame, density, sigma, out):  # type: ignore[no-untyped-def]
     """Evidence of hypotheses: query triangle ``corners[stars[h]]`` lies on ``places[h]`` (3, 2).
 
     The similarity of the three corners is carried outwards over the witnesses and refitted with each that
@@ -150,9 +170,9 @@ def _seed_evidence(query, stars, corners, others, places, points, starts, frame,
             place, squared = nearest(points, starts, frame, wx + u, wy + v, gate)
             here = _density(density, frame, wx + u, wy + v)
             if place < 0:
-                total += _gain(-1.0, variance, gate, here, share)
+                total += _gain(-1.0, variance, gate, here, shares[j])
             else:
-                total += _gain(squared, variance, gate, here, share)
+                total += _gain(squared, variance, gate, here, shares[j])
                 u, v = points[place, 0] - wx, points[place, 1] - wy
                 n += 1.0
                 qx, qy, rx, ry, qq = qx + x, qy + y, rx + u, ry + v, qq + x * x + y * y
@@ -180,9 +200,9 @@ def seed_evidence(
         if len(part):
             rows = slice(part[0], part[-1] + 1)
             _seed_evidence(
-                query.points_m, stars[rows], triangles, others, places_m[rows], reference.grid.points_m,
-                reference.grid.starts, reference.grid.frame, reference.density_per_m2, config.sigma_m,
-                config.match_share, out[rows],
+                query.points_m, query.shares, stars[rows], triangles, others, places_m[rows],
+                reference.grid.points_m, reference.grid.starts, reference.grid.frame,
+                reference.density_per_m2, config.sigma_m, out[rows],
             )  # fmt: skip
 
     with ThreadPoolExecutor(THREADS) as pool:
@@ -191,24 +211,23 @@ def seed_evidence(
 
 
 @njit(nogil=True, cache=True)
-def _placed_evidence(moved, points, starts, frame, density, sigma, share):  # type: ignore[no-untyped-def]
+def _placed_evidence(moved, shares, points, starts, frame, density, sigma):  # type: ignore[no-untyped-def]
     total = 0.0
     gate = min(MAX_GATE_M, GATE_SIGMAS * sigma)
     for j in range(len(moved)):
         place, squared = nearest(points, starts, frame, moved[j, 0], moved[j, 1], gate)
         here = _density(density, frame, moved[j, 0], moved[j, 1])
-        total += _gain(squared if place >= 0 else -1.0, sigma * sigma, gate, here, share)
+        total += _gain(squared if place >= 0 else -1.0, sigma * sigma, gate, here, shares[j])
     return total
 
 
 def placed_evidence(
-    moved_m: FloatArray, reference: Ground, config: MatcherConfig, share: float | None = None
+    moved_m: FloatArray, shares: FloatArray, reference: Ground, config: MatcherConfig
 ) -> float:
-    """Nats for a map whose buildings lie at (N, 2) in the world, of which the reference has a share
-    (``match_share`` unless given)."""
-    grid, settings = reference.grid, (config.sigma_m, config.match_share if share is None else share)
-    where = (grid.points_m, grid.starts, reference.grid.frame, reference.density_per_m2)
-    return float(_placed_evidence(moved_m, *where, *settings))
+    """Nats for a map whose buildings lie at (N, 2) in the world, each of which the reference has with a
+    probability (N,)."""
+    where = (reference.grid.points_m, reference.grid.starts, reference.grid.frame)
+    return float(_placed_evidence(moved_m, shares, *where, reference.density_per_m2, config.sigma_m))
 
 
 def area_evidence(

@@ -111,9 +111,9 @@ def ask(
     sigma, gate_m = max(sigma_m(covariance), math.hypot(*offset_m) / 2.0), GATE_SIGMAS * config.sigma_m
     shifts = _shifts(sigma, config)
     moves = shifts - offset_m
-    share = seen.share(config)
-    nats = placed_evidence(seen.points_m, reference, config, share)
-    others = np.array([placed_evidence(seen.points_m + move, reference, config, share) for move in moves])
+    shares = np.full(len(seen), seen.share(config))
+    nats = placed_evidence(seen.points_m, shares, reference, config)
+    others = np.array([placed_evidence(seen.points_m + move, shares, reference, config) for move in moves])
     # Of all places that the prediction leaves open, each as likely beforehand as the prediction has it.
     prior = np.exp(-0.5 * np.sum(shifts**2, axis=1) / (sigma**2 + config.sigma_m**2))
     somewhere = float(logsumexp(others, b=prior / prior.sum()))

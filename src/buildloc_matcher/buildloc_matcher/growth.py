@@ -126,14 +126,14 @@ def _settle(j, place, state, taken):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, cache=True)
 def _grow(  # type: ignore[no-untyped-def]
-    query, near, corners, places, a, b, points, starts, frame, density, sigma, share, taken, state, predicted
+    query, shares, near, corners, places, a, b, points, starts, frame, density, sigma, taken, state, predicted
 ):
     """Fill ``state`` (N,) and ``predicted`` (N, 2) from corners that lie on ``places``; the evidence.
 
     ``taken`` counts the buildings of the map on every place; zero before and after.
     """
     total = _grown_evidence(
-        query, near, corners, places, a, b, points, starts, frame, density, sigma, share, taken, state,
+        query, shares, near, corners, places, a, b, points, starts, frame, density, sigma, taken, state,
         predicted,
     )  # fmt: skip
     for place in state:
@@ -144,7 +144,7 @@ def _grow(  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, cache=True)
 def _grown_evidence(  # type: ignore[no-untyped-def]
-    query, near, corners, places, a, b, points, starts, frame, density, sigma, share, taken, state, predicted
+    query, shares, near, corners, places, a, b, points, starts, frame, density, sigma, taken, state, predicted
 ):
     count = len(query)
     turn = np.empty((count, 2))
@@ -174,7 +174,7 @@ def _grown_evidence(  # type: ignore[no-untyped-def]
         place, squared = nearest(points, starts, frame, x, y, gate)
         _settle(j, place, state, taken)
         matched = state[j] >= 0
-        total += _gain(squared if matched else -1.0, variance, gate, _density(density, frame, x, y), share)
+        total += _gain(squared if matched else -1.0, variance, gate, _density(density, frame, x, y), shares[j])
         if matched:
             _turn(j, query, near, state, points, turn, a, b)
             _support(j, near, state, support, most)
@@ -195,7 +195,7 @@ def _grown_evidence(  # type: ignore[no-untyped-def]
             _settle(j, place, state, taken)
             matched = state[j] >= 0
             here = _density(density, frame, x, y)
-            total += _gain(squared if matched else -1.0, variance, gate, here, share)
+            total += _gain(squared if matched else -1.0, variance, gate, here, shares[j])
             if matched:
                 _turn(j, query, near, state, points, turn, a, b)
     return total
@@ -218,7 +218,7 @@ def grow(
     edges, moved = np.roll(source, -1, 1) - source, np.roll(target, -1, 1) - target
     turns = (np.conj(edges) * moved).sum(axis=1) / np.maximum((np.abs(edges) ** 2).sum(axis=1), 1e-9)
     where = (reference.grid.points_m, reference.grid.starts, reference.grid.frame)
-    settings = (reference.density_per_m2, config.sigma_m, config.match_share)
+    settings = (reference.density_per_m2, config.sigma_m)
     states = np.empty((len(corners), len(query.points_m)), dtype=np.int64)
     taken = np.zeros(len(reference.buildings_m), dtype=np.int32)
     grown: list[tuple[int, Grown]] = []
@@ -228,7 +228,7 @@ def grow(
             continue
         state, predicted = states[len(grown)], np.empty((len(query.points_m), 2))
         start = (triangle, seats, turns[c].real, turns[c].imag)
-        nats = _grow(query.points_m, query.neighbours, *start, *where, *settings, taken, state, predicted)
+        nats = _grow(query.points_m, query.shares, query.neighbours, *start, *where, *settings, taken, state, predicted)
         if nats > 0.0:
             matched = np.where(state >= 0, reference.grid.order[np.maximum(state, 0)], NO_MATCH)
             grown.append((c, Grown(matched, predicted, nats)))

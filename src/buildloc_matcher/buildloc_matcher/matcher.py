@@ -136,7 +136,7 @@ class Matcher:
         )
         if len(points) < FEWEST_BUILDINGS:
             return MatchResult((), (), (), np.empty((0, 2)), None, {"buildings": len(points)}, clock.seconds)
-        query = query_map(points, areas)
+        query = query_map(points, areas, config)
         for number, look in enumerate(self._looks, start=1):
             with clock.stage("describe"):
                 found = mesh(points, areas, shapes, look.thinnings, look.max_stars)

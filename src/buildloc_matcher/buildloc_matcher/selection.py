@@ -236,7 +236,8 @@ def _start(cluster: Cluster, query: QueryMap) -> Similarity:
 def score_rigid(transform: Similarity, query: QueryMap, reference: Ground, config: MatcherConfig) -> Score:
     """A candidate as the paper scores it: one transform for the whole map."""
     moved = transform.apply(query.points_m)
-    return _scored(transform, moved, placed_evidence(moved, reference, config), query, reference, config)
+    evidence = placed_evidence(moved, query.shares, reference, config)
+    return _scored(transform, moved, evidence, query, reference, config)
 
 
 def score_grown(
