@@ -109,7 +109,8 @@ def query_map(points_m: FloatArray, areas_m2: FloatArray, config: MatcherConfig)
 
 
 def witnesses(points_m: FloatArray, triangles: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(S, WITNESSES) map buildings nearest to each triangle (S, 3), its corners left out; NO_MATCH pads."""
+    """(S, WITNESSES) map buildings nearest to each triangle or pair (S, K), its corners left out; NO_MATCH
+    pads."""
     if not len(triangles):
         return np.empty((0, WITNESSES), dtype=np.int64)
     count = min(WITNESSES + 3, len(points_m))
@@ -138,9 +139,9 @@ def _gain(squared, variance, gate, density, share):  # type: ignore[no-untyped-d
 
 @njit(nogil=True, cache=True)
 def _seed_evidence(query, shares, stars, corners, others, places, points, starts, frame, density, sigma, out):  # type: ignore[no-untyped-def]
-    """Evidence of hypotheses: query triangle ``corners[stars[h]]`` lies on ``places[h]`` (3, 2).
+    """Evidence of hypotheses: query triangle or pair ``corners[stars[h]]`` lies on ``places[h]`` (K, 2).
 
-    The similarity of the three corners is carried outwards over the witnesses and refitted with each that
+    The similarity of the corners is carried outwards over the witnesses and refitted with each that
     is found (running sums of a least-squares fit).
     """
     for h in range(len(stars)):
@@ -148,7 +149,7 @@ def _seed_evidence(query, shares, stars, corners, others, places, points, starts
         n, qx, qy, rx, ry, qq, real, imag = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         ox, oy = query[corners[s, 0], 0], query[corners[s, 0], 1]
         wx, wy = places[h, 0, 0], places[h, 0, 1]
-        for k in range(3):
+        for k in range(corners.shape[1]):
             x, y = query[corners[s, k], 0] - ox, query[corners[s, k], 1] - oy
             u, v = places[h, k, 0] - wx, places[h, k, 1] - wy
             n += 1.0
@@ -190,8 +191,8 @@ def seed_evidence(
     reference: Ground,
     config: MatcherConfig,
 ) -> FloatArray:
-    """(H,) nats for hypotheses: the map's triangle ``stars[h]``, a row of ``triangles`` (S, 3), lies on
-    places (H, 3, 2)."""
+    """(H,) nats for hypotheses: the map's triangle (or pair) ``stars[h]``, a row of ``triangles`` (S, K),
+    lies on places (H, K, 2)."""
     out = np.empty(len(stars))
     others = witnesses(query.points_m, triangles)
     parts = np.array_split(np.arange(len(stars)), THREADS)

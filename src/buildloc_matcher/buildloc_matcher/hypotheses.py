@@ -34,6 +34,15 @@ class Hypotheses:
     def __len__(self) -> int:
         return len(self.weights)
 
+    def joined(self, other: Hypotheses, stars: int) -> Hypotheses:
+        """These and others, whose stars come after so many."""
+        both = ((getattr(self, name), getattr(other, name)) for name in (
+            "places_m", "positions_m", "yaws_rad", "scales", "weights"))
+        return Hypotheses(
+            np.concatenate([self.stars, other.stars + stars]), *(np.concatenate(b) for b in both),
+            mirrored=self.mirrored + other.mirrored, off_scale=self.off_scale + other.off_scale,
+        )
+
     def weighted(self, weights: FloatArray) -> Hypotheses:
         """The hypotheses whose new vote is positive."""
         kept = weights > 0.0

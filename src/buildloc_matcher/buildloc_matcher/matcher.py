@@ -21,6 +21,7 @@ from buildloc_matcher.hypotheses import hypothesize
 from buildloc_matcher.local_map import check_map
 from buildloc_matcher.match_cache import MakeStarMatcher, MatchCache, StarMatcher
 from buildloc_matcher.mesh import Mesh, mesh
+from buildloc_matcher.pairs import pair_hypotheses
 from buildloc_matcher.pursuit import Agreement, Place
 from buildloc_matcher.reference.buildings import OUTLINE_UNIT_M
 from buildloc_matcher.reference.database import DatabaseError, ReferenceDatabase, descriptor_hash
@@ -66,6 +67,7 @@ class _Look:
 
     thinnings: int
     max_stars: int
+    pairs: int
     star_matcher: StarMatcher
 
 
@@ -100,9 +102,9 @@ class Matcher:
         self.database = database
         self.config = config
         second = replace(config, matches_per_star=config.second_look_matches)
-        self._looks = [_Look(0, config.max_stars or MOST_STARS, star_matcher(database.tables, config))]
+        self._looks = [_Look(0, config.max_stars or MOST_STARS, 0, star_matcher(database.tables, config))]
         if config.second_look:
-            self._looks.append(_Look(config.second_look, MOST_STARS, star_matcher(database.tables, second)))
+            self._looks.append(_Look(config.second_look, MOST_STARS, config.second_look_pairs, star_matcher(database.tables, second)))
 
     def warm_up(self) -> None:
         """Locate and refine a piece of the reference itself: compiled code is loaded, and on a new machine
@@ -140,15 +142,15 @@ class Matcher:
         for number, look in enumerate(self._looks, start=1):
             with clock.stage("describe"):
                 found = mesh(points, areas, shapes, look.thinnings, look.max_stars)
-            result = self._look(found, look.star_matcher, query, clock)
+            result = self._look(found, look, query, clock)
             result = replace(result, funnel=result.funnel | {"buildings": len(points), "looks": number})
             if self.judge(result).outcome is Outcome.ACCEPTED:
                 break
         return result
 
-    def _look(self, found: Mesh, star_matcher: StarMatcher, query: QueryMap, clock: _Clock) -> MatchResult:
+    def _look(self, found: Mesh, look: _Look, query: QueryMap, clock: _Clock) -> MatchResult:
         """Once from stars to ranked candidates."""
-        config, reference = self.config, self.database.ground
+        config, reference, star_matcher = self.config, self.database.ground, look.star_matcher
         centre = query.points_m.mean(axis=0)
         with clock.stage("match"):
             matches = star_matcher.match(found.stars)
@@ -160,9 +162,15 @@ class Matcher:
                 seeds = (hypotheses.stars, hypotheses.places_m)
                 nats = seed_evidence(query, found.corners, *seeds, reference, config)
                 voters = hypotheses.weighted(np.where(nats > 0.0, np.exp(nats), 0.0))
+        corners = found.corners
+        if look.pairs:
+            with clock.stage("pairs"):
+                ends, paired = pair_hypotheses(query, reference, look.pairs, config)
+            voters, corners = voters.joined(paired, len(corners)), np.concatenate([corners, ends])
+        with clock.stage("vote"):
             ballot = vote(voters, config)
         with clock.stage("select"):
-            selected = select(ballot, voters, found.corners, query, reference, config)
+            selected = select(ballot, voters, corners, query, reference, config)
             candidates = tuple(self._candidate(c, score, centre, query) for c, score in selected)
         funnel: dict[str, float] = {
             "stars": len(found.stars),
