@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from concurrent.futures import ThreadPoolExecutor
+from itertools import product
 
 import numpy as np
 from buildloc_msgs_py.types import FloatArray
@@ -16,14 +17,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 from buildloc_matcher.config import MatcherConfig
-from buildloc_matcher.evidence import Ground, QueryMap, seed_evidence, witnesses
-from buildloc_matcher.hypotheses import Hypotheses
+from buildloc_matcher.evidence import GATE_SIGMAS, Ground, QueryMap, _seed_evidence, witnesses
+from buildloc_matcher.hypotheses import NO_HYPOTHESES, Hypotheses
 from buildloc_matcher.matching import THREADS
 from buildloc_matcher.point_grid import nearest
 
 LENGTHS_M = (15.0, 120.0)
 LENGTH_OFF_M, LENGTH_OFF = 4.0, 0.05  # how much longer or shorter it may be in the reference: m, and share
 LOG_AREA_OFF = 0.6
+AT_ONCE = 1 << 16  # buildings of the reference whose pairs are in memory together
 USED_OFTEN = 2  # pairs of one building, so that not all of them fail with it
 
 
@@ -46,13 +48,14 @@ def choose_pairs(query: QueryMap, reference: Ground, count: int) -> NDArray[np.i
 
 
 @njit(nogil=True, cache=True)
-def _like(length, off, first, second, points, sizes, starts, frame):  # type: ignore[no-untyped-def]
-    """(H, 2) places of the reference so far apart whose sizes are near the first and the second."""
+def _like(length, off, first, second, begin, end, points, sizes, starts, frame):  # type: ignore[no-untyped-def]
+    """(H, 2) places of the reference so far apart whose sizes are near the first and the second; the first of
+    them from ``begin`` to ``end``."""
     west, south, cell, columns, rows = frame
     found, count = np.empty((1024, 2), np.int64), 0
     reach = length + off
     low, high = (length - off) ** 2, reach**2
-    for p in range(len(points)):
+    for p in range(begin, end):
         if abs(sizes[p] - first) > LOG_AREA_OFF:
             continue
         x, y = points[p, 0], points[p, 1]
@@ -61,8 +64,7 @@ def _like(length, off, first, second, points, sizes, starts, frame):  # type: ig
         first_row = max(0, math.floor((y - reach - south) / cell))
         last_row = min(rows - 1, math.floor((y + reach - south) / cell))
         for row in range(first_row, last_row + 1):
-            begin, end = starts[row * columns + first_column], starts[row * columns + last_column + 1]
-            for q in range(begin, end):
+            for q in range(starts[row * columns + first_column], starts[row * columns + last_column + 1]):
                 if abs(sizes[q] - second) > LOG_AREA_OFF:
                     continue
                 squared = (points[q, 0] - x) ** 2 + (points[q, 1] - y) ** 2
@@ -103,27 +105,33 @@ def pair_hypotheses(
     sizes = np.log(reference.areas_m2[grid.order].astype(np.float64))
     others = witnesses(query.points_m, pairs)
 
-    def work(number: int) -> tuple[FloatArray, ...]:
-        pair = pairs[number]
-        length = float(np.hypot(*(query.points_m[pair[1]] - query.points_m[pair[0]])))
-        off = LENGTH_OFF_M + LENGTH_OFF * length
-        first, second = np.log(query.areas_m2[pair]).tolist()
-        like = _like(length, off, first, second, grid.points_m, sizes, grid.starts, grid.frame)
-        return like, np.full(len(like), number)
+    where = (grid.points_m, grid.starts, grid.frame)
 
+    def work(number: int, begin: int) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
+        pair, end = pairs[number], min(begin + AT_ONCE, len(sizes))
+        length = float(np.hypot(*(query.points_m[pair[1]] - query.points_m[pair[0]])))
+        off, (first, second) = LENGTH_OFF_M + LENGTH_OFF * length, np.log(query.areas_m2[pair])
+        like = _like(length, off, first, second, begin, end, grid.points_m, sizes, grid.starts, grid.frame)
+        numbers, nats = np.full(len(like), number), np.empty(len(like))
+        _seed_evidence(
+            query.points_m, query.shares, numbers, pairs, others, grid.points_m[like], *where,
+            reference.density_per_m2, config.sigma_m, nats,
+        )  # fmt: skip
+        good = nats > 0.0
+        return like[good], numbers[good], nats[good]
+
+    jobs = list(product(range(len(pairs)), range(0, len(sizes), AT_ONCE)))
+    if not jobs:
+        return np.empty((0, 3), dtype=np.int64), NO_HYPOTHESES
     with ThreadPoolExecutor(THREADS) as pool:
-        found = list(pool.map(work, range(len(pairs))))
-    places = np.concatenate([np.empty((0, 2), dtype=np.int64), *(like for like, _ in found)])
-    numbers = np.concatenate([np.empty(0, dtype=np.int64), *(of for _, of in found)])
-    nats = seed_evidence(query, pairs, numbers, grid.points_m[places], reference, config)
-    good = nats > 0.0
-    places, numbers, nats = places[good], numbers[good], nats[good]
+        found = zip(*pool.map(work, *zip(*jobs, strict=True)), strict=True)
+        places, numbers, nats = (np.concatenate(parts) for parts in found)
     ends, theirs = query.points_m[pairs[numbers]] @ (1.0, 1.0j), grid.points_m[places] @ (1.0, 1.0j)
     turns = (theirs[:, 1] - theirs[:, 0]) / (ends[:, 1] - ends[:, 0])
     corners, corner_places = np.empty((len(places), 3), dtype=np.int64), np.empty((len(places), 3, 2))
     _thirds(
-        query.points_m, pairs[numbers], others[numbers], turns, places, grid.points_m, grid.starts,
-        grid.frame, 3.0 * config.sigma_m * math.sqrt(2.0), corners, corner_places,
+        query.points_m, pairs[numbers], others[numbers], turns, places, *where,
+        GATE_SIGMAS * math.sqrt(2.0) * config.sigma_m, corners, corner_places,
     )  # fmt: skip
     whole = corners[:, 2] >= 0
     centre = query.points_m.mean(axis=0) @ (1.0, 1.0j)
