@@ -108,13 +108,16 @@ def query_map(points_m: FloatArray, areas_m2: FloatArray, config: MatcherConfig)
     )  # fmt: skip
 
 
-def witnesses(points_m: FloatArray, triangles: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(S, WITNESSES) map buildings nearest to each triangle or pair (S, K), its corners left out; NO_MATCH
-    pads."""
-    if not len(triangles):
-        return np.empty((0, WITNESSES), dtype=np.int64)
-    count = min(WITNESSES + 3, len(points_m))
-    _, near = cKDTree(points_m).query(points_m[triangles].mean(axis=1), k=count)
+def witnesses(query: QueryMap, triangles: NDArray[np.int64], config: MatcherConfig) -> NDArray[np.int64]:
+    """(S, WITNESSES) buildings of the map nearest to each triangle or pair (S, K), its corners left out, and
+    those that are more likely invented than not; NO_MATCH pads."""
+    likely = np.flatnonzero(query.shares >= 0.5 * config.match_share)
+    if not len(triangles) or not len(likely):
+        return np.full((len(triangles), WITNESSES), NO_MATCH, dtype=np.int64)
+    count = min(WITNESSES + triangles.shape[1], len(likely))
+    middles = query.points_m[triangles].mean(axis=1)
+    _, rows = cKDTree(query.points_m[likely]).query(middles, k=np.arange(1, count + 1))
+    near = likely[rows]
     own = (near[:, :, None] == triangles[:, None, :]).any(axis=2)
     others = np.take_along_axis(np.where(own, NO_MATCH, near), np.argsort(own, axis=1, kind="stable"), axis=1)
     return np.ascontiguousarray(others[:, :WITNESSES].astype(np.int64))
@@ -144,8 +147,9 @@ def _seed_evidence(query, shares, stars, corners, others, places, points, starts
     The similarity of the corners is carried outwards over the witnesses and refitted with each that
     is found (running sums of a least-squares fit).
     """
+    held = np.empty(corners.shape[1] + others.shape[1], np.int64)
     for h in range(len(stars)):
-        s = stars[h]
+        s, holds = stars[h], 0
         n, qx, qy, rx, ry, qq, real, imag = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         ox, oy = query[corners[s, 0], 0], query[corners[s, 0], 1]
         wx, wy = places[h, 0, 0], places[h, 0, 1]
@@ -170,10 +174,15 @@ def _seed_evidence(query, shares, stars, corners, others, places, points, starts
             gate = min(MAX_GATE_M, GATE_SIGMAS * math.sqrt(variance))
             place, squared = nearest(points, starts, frame, wx + u, wy + v, gate)
             here = _density(density, frame, wx + u, wy + v)
+            for k in range(holds):
+                if held[k] == place:
+                    place = NO_MATCH
             if place < 0:
                 total += _gain(-1.0, variance, gate, here, shares[j])
             else:
                 total += _gain(squared, variance, gate, here, shares[j])
+                held[holds] = place
+                holds += 1
                 u, v = points[place, 0] - wx, points[place, 1] - wy
                 n += 1.0
                 qx, qy, rx, ry, qq = qx + x, qy + y, rx + u, ry + v, qq + x * x + y * y
@@ -194,7 +203,7 @@ def seed_evidence(
     """(H,) nats for hypotheses: the map's triangle (or pair) ``stars[h]``, a row of ``triangles`` (S, K),
     lies on places (H, K, 2)."""
     out = np.empty(len(stars))
-    others = witnesses(query.points_m, triangles)
+    others = witnesses(query, triangles, config)
     parts = np.array_split(np.arange(len(stars)), THREADS)
 
     def work(part: NDArray[np.int64]) -> None:

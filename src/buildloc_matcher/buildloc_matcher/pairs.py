@@ -37,10 +37,10 @@ def choose_pairs(query: QueryMap, reference: Ground, count: int) -> NDArray[np.i
     ends = np.unique(np.sort(ends, axis=1), axis=0)
     lengths = np.hypot(*(query.points_m[ends[:, 1]] - query.points_m[ends[:, 0]]).T)
     ends, lengths = (some[(lengths >= LENGTHS_M[0]) & (lengths <= LENGTHS_M[1])] for some in (ends, lengths))
-    worth = np.log(query.shares[ends]).sum(axis=1) - np.log(np.maximum(alike[ends], 1)).sum(axis=1)
+    worth = np.log(query.shares[ends]).sum(axis=1) - 0.5 * np.log(np.maximum(alike[ends], 1)).sum(axis=1)
     used = np.zeros(len(query.points_m), dtype=np.int64)
     chosen = []
-    for pair in ends[np.argsort(np.log(lengths) - worth, kind="stable")]:
+    for pair in ends[np.argsort(0.5 * np.log(lengths) - worth, kind="stable")]:
         if len(chosen) < count and (used[pair] < USED_OFTEN).all():
             used[pair] += 1
             chosen.append(pair)
@@ -103,7 +103,7 @@ def pair_hypotheses(
     of so many pairs; their votes are their likelihoods."""
     pairs, grid = choose_pairs(query, reference, count), reference.grid
     sizes = np.log(reference.areas_m2[grid.order].astype(np.float64))
-    others = witnesses(query.points_m, pairs)
+    others = witnesses(query, pairs, config)
 
     where = (grid.points_m, grid.starts, grid.frame)
 
