@@ -45,7 +45,7 @@ def alike(points_m: FloatArray) -> Ground:
 
 def mapped(points_m: FloatArray) -> QueryMap:
     """A map of buildings at (N, 2) that all have the same area."""
-    return query_map(points_m, np.full(len(points_m), 150.0))
+    return query_map(points_m, np.full(len(points_m), 150.0), DEFAULT)
 
 
 def town(

@@ -217,7 +217,7 @@ def test_without_clusters_there_is_no_candidate() -> None:
 
 
 def test_a_match_of_fewer_than_three_scores_as_its_cluster() -> None:
-    cluster = Cluster(*CITY.centroids_m.mean(axis=0), 0.3, 1.0, 1.0, 1, 0)
+    cluster = Cluster(*CITY.centroids_m.mean(axis=0), 0.3, 1.0, 1.0, 1, (0,))
     centre = BENT.mean(axis=0)
     start = Similarity((centre[0], centre[1]), (cluster.x_m, cluster.y_m), 0.3)
     ((_, grown),) = grow(MAP, MIDDLE[None], SEEN.centroids_m[MIDDLE][None], GROUND, DEFAULT)

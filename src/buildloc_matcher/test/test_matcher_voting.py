@@ -38,7 +38,7 @@ def test_a_bin_reaches_half_its_size_around_whole_multiples() -> None:
         (pytest.approx(1.9), 2),
         (pytest.approx(1.3), 3),
     ]
-    assert [c.best for c in ballot.clusters] == [5, 4, 1]
+    assert [c.seeds for c in ballot.clusters] == [(5,), (4, 3), (1, 0, 2)]
 
 
 def test_a_cluster_is_the_mean_weighted_by_votes() -> None:
@@ -51,7 +51,7 @@ def test_a_cluster_is_the_mean_weighted_by_votes() -> None:
         3 * math.cos(math.radians(2)) + math.cos(math.radians(-4)),
     )
     assert cluster.yaw_rad == pytest.approx(mean) and cluster.scale == pytest.approx(1.05)
-    assert (cluster.votes, cluster.members, cluster.best) == (4.0, 2, 1)
+    assert (cluster.votes, cluster.members, cluster.seeds) == (4.0, 2, (1, 0))
 
 
 def test_other_headings_in_the_same_place_do_not_count() -> None:
@@ -61,7 +61,7 @@ def test_other_headings_in_the_same_place_do_not_count() -> None:
     # Around 0 degrees three weigh 3; the two around 90 weigh 2.6.
     assert (cluster.votes, cluster.members) == (3.0, 3) and cluster.yaw_rad == pytest.approx(0.0, abs=1e-12)
     (heavier,) = vote(hypotheses((0, 0, 0, 1.0), (0, 0, 5, 1.0), (20, 0, 90, 2.5)), CONFIG).clusters
-    assert (heavier.votes, heavier.members, heavier.best, heavier.x_m) == (2.5, 1, 2, 20.0)
+    assert (heavier.votes, heavier.members, heavier.seeds, heavier.x_m) == (2.5, 1, (2,), 20.0)
 
 
 def test_headings_wrap_around() -> None:
@@ -88,7 +88,7 @@ def test_turning_all_headings_turns_the_clusters(turn: float, seed: int) -> None
     one, other = (vote(hypotheses(*map(tuple, r)), CONFIG) for r in (rows, turned))
     assert (one.bins, one.consistent) == (other.bins, other.consistent)
     for a, b in zip(one.clusters, other.clusters, strict=True):
-        assert (a.members, a.best) == (b.members, b.best)
+        assert (a.members, a.seeds) == (b.members, b.seeds)
         assert (a.x_m, a.y_m, a.votes) == pytest.approx((b.x_m, b.y_m, b.votes))
         assert math.remainder(b.yaw_rad - a.yaw_rad - math.radians(turn), 2.0 * math.pi) == pytest.approx(
             0.0, abs=1e-9
@@ -108,7 +108,7 @@ def test_ties_are_ranked_from_west_and_south_whatever_the_order() -> None:
     for order in ((0, 1, 2), (2, 0, 1), (1, 2, 0)):
         clusters = vote(hypotheses(*[rows[i] for i in order]), CONFIG).clusters
         assert [(c.x_m, c.y_m) for c in clusters] == [(-100.0, 0.0), (-100.0, 300.0), (200.0, 0.0)]
-        assert [rows[order[c.best]][:2] for c in clusters] == [(c.x_m, c.y_m) for c in clusters]
+        assert [rows[order[c.seeds[0]]][:2] for c in clusters] == [(c.x_m, c.y_m) for c in clusters]
 
 
 def test_no_hypothesis_is_no_bin() -> None:
