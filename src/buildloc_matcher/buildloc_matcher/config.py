@@ -66,7 +66,7 @@ class MatcherConfig:
         10.0, "half width of a rotation-consistent cluster, deg", 0.1, 180.0
     )
     min_votes: int = param(1, "fewest rotation-consistent votes of a candidate", 1, 10000)
-    top_k: int = param(400, "candidates rescored", 1, 10000)
+    top_k: int = param(100, "candidates rescored", 1, 10000)
     selection: str = param(
         "grow",
         "candidates are scored as rigid (Eq. 4) or grow from their best seed and follow the map's bend",

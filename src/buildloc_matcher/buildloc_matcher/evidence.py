@@ -32,6 +32,8 @@ GATE_SIGMAS = 3.0
 MAX_GATE_M = 16.0
 HOPELESS = -10.0  # a hypothesis that has sunk below this is given up
 NO_MATCH = -1
+# Nobody knows how much a segmenter invents on this ground, as in snow: as likely the shares are so much lower.
+DOUBT = 0.4
 FALSE_SIZE_SPREAD, SIZE_BLUR = 0.5, 0.3  # of the logarithm of areas: invented buildings; a size of the map
 LEAST_REAL = 0.1
 FEWEST_AREAS = 4
@@ -138,6 +140,13 @@ def _gain(squared, variance, gate, density, share):  # type: ignore[no-untyped-d
         return math.log(1.0 - share * (1.0 - math.exp(-0.5 * gate * gate / variance)))
     likely = share * math.exp(-0.5 * squared / variance) / (2.0 * math.pi * variance)
     return math.log(likely / density * math.exp(math.pi * density * squared) + (1.0 - share))
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _either(sure, doubtful):  # type: ignore[no-untyped-def]
+    """Evidence where the shares are as likely right as DOUBT times too high."""
+    high = max(sure, doubtful)
+    return high + math.log(0.5 * math.exp(sure - high) + 0.5 * math.exp(doubtful - high))
 
 
 @njit(nogil=True, cache=True)

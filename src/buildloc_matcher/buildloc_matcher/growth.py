@@ -7,6 +7,7 @@ building is looked for where its matched neighbours predict it.
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,14 +17,17 @@ from numpy.typing import NDArray
 
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.evidence import (
+    DOUBT,
     GATE_SIGMAS,
     MAX_GATE_M,
     NO_MATCH,
     Ground,
     QueryMap,
     _density,
+    _either,
     _gain,
 )
+from buildloc_matcher.matching import THREADS
 from buildloc_matcher.point_grid import nearest
 
 UNKNOWN = -2
@@ -160,7 +164,7 @@ def _grown_evidence(  # type: ignore[no-untyped-def]
     for k in range(3):
         _turn(corners[k], query, near, state, points, turn, a, b)
         _support(corners[k], near, state, support, most)
-    total = 0.0
+    sure, doubtful = 0.0, 0.0
     while True:
         # Next comes the building with the most matched neighbours: the surest prediction.
         j = _most_supported(support, most)
@@ -174,15 +178,17 @@ def _grown_evidence(  # type: ignore[no-untyped-def]
         place, squared = nearest(points, starts, frame, x, y, gate)
         _settle(j, place, state, taken)
         matched = state[j] >= 0
-        total += _gain(squared if matched else -1.0, variance, gate, _density(density, frame, x, y), shares[j])
+        here = _density(density, frame, x, y)
+        sure += _gain(squared if matched else -1.0, variance, gate, here, shares[j])
+        doubtful += _gain(squared if matched else -1.0, variance, gate, here, DOUBT * shares[j])
         if matched:
             _turn(j, query, near, state, points, turn, a, b)
             _support(j, near, state, support, most)
-        if total < GIVE_UP:
-            return total
+        if max(sure, doubtful) < GIVE_UP:
+            return max(sure, doubtful)
     # Once more with all neighbours known: early guesses are put right, and the evidence is the final one.
     for _ in range(PASSES):
-        total = 0.0
+        sure, doubtful = 0.0, 0.0
         for j in range(count):
             x, y, a, b, variance, weight = _predict(j, query, near, state, points, turn, sigma)
             if weight == 0.0:
@@ -195,10 +201,54 @@ def _grown_evidence(  # type: ignore[no-untyped-def]
             _settle(j, place, state, taken)
             matched = state[j] >= 0
             here = _density(density, frame, x, y)
-            total += _gain(squared if matched else -1.0, variance, gate, here, shares[j])
+            sure += _gain(squared if matched else -1.0, variance, gate, here, shares[j])
+            doubtful += _gain(squared if matched else -1.0, variance, gate, here, DOUBT * shares[j])
             if matched:
                 _turn(j, query, near, state, points, turn, a, b)
-    return total
+    return _either(sure, doubtful)
+
+
+@njit(nogil=True, cache=True)
+def _grown_nats(  # type: ignore[no-untyped-def]
+    query, shares, near, corners, places, points, starts, frame, density, sigma, out
+):
+    taken = np.zeros(len(points), np.int32)
+    state, predicted, seats = np.empty(len(query), np.int64), np.empty((len(query), 2)), np.empty(3, np.int64)
+    for h in range(len(corners)):
+        a, b, squares = 0.0, 0.0, 1e-9
+        for k in range(3):
+            seats[k], _ = nearest(points, starts, frame, places[h, k, 0], places[h, k, 1], TOUCHING_M)
+            i, j, m = corners[h, k], corners[h, (k + 1) % 3], (k + 1) % 3
+            x, y = query[j, 0] - query[i, 0], query[j, 1] - query[i, 1]
+            u, v = places[h, m, 0] - places[h, k, 0], places[h, m, 1] - places[h, k, 1]
+            a, b, squares = a + x * u + y * v, b + x * v - y * u, squares + x * x + y * y
+        out[h] = _grow(
+            query, shares, near, corners[h], seats, a / squares, b / squares, points, starts, frame, density,
+            sigma, taken, state, predicted,
+        )  # fmt: skip
+
+
+def grown_nats(
+    query: QueryMap,
+    corners: NDArray[np.int64],
+    places_m: FloatArray,
+    reference: Ground,
+    config: MatcherConfig,
+) -> FloatArray:
+    """(C,) nats of the match that grows from each seed, corners (C, 3) on places (C, 3, 2)."""
+    out = np.empty(len(corners))
+    where = (reference.grid.points_m, reference.grid.starts, reference.grid.frame)
+
+    def work(part: NDArray[np.int64]) -> None:
+        _grown_nats(
+            query.points_m, query.shares, query.neighbours, corners[part], places_m[part], *where,
+            reference.density_per_m2, config.sigma_m, nats := np.empty(len(part)),
+        )  # fmt: skip
+        out[part] = nats
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        list(pool.map(work, np.array_split(np.arange(len(corners)), THREADS)))
+    return out
 
 
 def grow(

@@ -43,6 +43,13 @@ class Hypotheses:
             mirrored=self.mirrored + other.mirrored, off_scale=self.off_scale + other.off_scale,
         )
 
+    def heaviest(self, count: int) -> Hypotheses:
+        """So many with the largest votes."""
+        if len(self) <= count:
+            return self
+        least = np.partition(self.weights, len(self) - count)[len(self) - count]
+        return self.weighted(np.where(self.weights >= least, self.weights, 0.0))
+
     def weighted(self, weights: FloatArray) -> Hypotheses:
         """The hypotheses whose new vote is positive."""
         kept = weights > 0.0

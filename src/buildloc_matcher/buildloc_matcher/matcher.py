@@ -17,6 +17,7 @@ from buildloc_matcher.config import MatcherConfig, check_matcher
 from buildloc_matcher.evidence import QueryMap, query_map, seed_evidence
 from buildloc_matcher.follow import Followed, follow
 from buildloc_matcher.geometry import Similarity, wrap
+from buildloc_matcher.growth import grown_nats
 from buildloc_matcher.hypotheses import hypothesize
 from buildloc_matcher.local_map import check_map
 from buildloc_matcher.match_cache import MakeStarMatcher, MatchCache, StarMatcher
@@ -32,6 +33,7 @@ from buildloc_matcher.window import start
 
 FEWEST_BUILDINGS = 4
 WARM_UP_BUILDINGS = 40
+MOST_GROWN = 20000  # hypotheses of a look that matches are grown from, the likeliest
 MOST_STARS = 4096  # of one look; those of a map of 100,000 buildings, matched, would fill 30 GB
 
 
@@ -167,6 +169,11 @@ class Matcher:
             with clock.stage("pairs"):
                 ends, paired = pair_hypotheses(query, reference, look.pairs, config)
             voters, corners = voters.joined(paired, len(corners)), np.concatenate([corners, ends])
+        if config.votes == "evidence":
+            with clock.stage("grow"):
+                likeliest = voters.heaviest(MOST_GROWN)
+                nats = grown_nats(query, corners[likeliest.stars], likeliest.places_m, reference, config)
+                voters = likeliest.weighted(np.where(nats > 0.0, np.exp(nats), 0.0))
         with clock.stage("vote"):
             ballot = vote(voters, config)
         with clock.stage("select"):
