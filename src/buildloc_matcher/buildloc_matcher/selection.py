@@ -27,7 +27,7 @@ from buildloc_matcher.hypotheses import Hypotheses
 from buildloc_matcher.point_grid import near, nearest
 from buildloc_matcher.voting import Ballot, Cluster
 
-GROWN_SCORED = 10  # distinct grown matches that get the full score
+GROWN_SCORED = 30  # distinct grown matches that get the full score
 NEGLIGIBLE_NATS = 60.0  # a match that much less likely than the best is not listed
 LOCAL_M = 100.0  # pairs around a place that tell how the map lies there, and how many it takes
 LOCAL_PAIRS = 6
