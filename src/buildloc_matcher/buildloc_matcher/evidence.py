@@ -150,7 +150,7 @@ def _either(sure, doubtful):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _seed_evidence(query, shares, stars, corners, others, places, points, starts, frame, density, sigma, out):  # type: ignore[no-untyped-def]
+def _seed_evidence(query, shares, stars, corners, others, places, points, starts, frame, density, sigma, hopeless, out):  # type: ignore[no-untyped-def]
     """Evidence of hypotheses: query triangle or pair ``corners[stars[h]]`` lies on ``places[h]`` (K, 2).
 
     The similarity of the corners is carried outwards over the witnesses and refitted with each that
@@ -196,7 +196,7 @@ def _seed_evidence(query, shares, stars, corners, others, places, points, starts
                 n += 1.0
                 qx, qy, rx, ry, qq = qx + x, qy + y, rx + u, ry + v, qq + x * x + y * y
                 real, imag = real + x * u + y * v, imag + x * v - y * u
-            if total < HOPELESS:
+            if total < hopeless:
                 break
         out[h] = total
 
@@ -208,9 +208,10 @@ def seed_evidence(
     places_m: FloatArray,
     reference: Ground,
     config: MatcherConfig,
+    hopeless: float = HOPELESS,
 ) -> FloatArray:
     """(H,) nats for hypotheses: the map's triangle (or pair) ``stars[h]``, a row of ``triangles`` (S, K),
-    lies on places (H, K, 2)."""
+    lies on places (H, K, 2). One that has sunk below ``hopeless`` is given up."""
     out = np.empty(len(stars))
     others = witnesses(query, triangles, config)
     parts = np.array_split(np.arange(len(stars)), THREADS)
@@ -221,7 +222,7 @@ def seed_evidence(
             _seed_evidence(
                 query.points_m, query.shares, stars[rows], triangles, others, places_m[rows],
                 reference.grid.points_m, reference.grid.starts, reference.grid.frame,
-                reference.density_per_m2, config.sigma_m, out[rows],
+                reference.density_per_m2, config.sigma_m, hopeless, out[rows],
             )  # fmt: skip
 
     with ThreadPoolExecutor(THREADS) as pool:

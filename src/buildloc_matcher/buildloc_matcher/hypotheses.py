@@ -59,11 +59,6 @@ class Hypotheses:
         )  # fmt: skip
 
 
-NO_HYPOTHESES = Hypotheses(
-    np.empty(0, dtype=np.int64), np.empty((0, 3, 2)), np.empty((0, 2)), *(np.empty(0),) * 3, 0, 0
-)
-
-
 @njit(nogil=True, cache=True)
 def _similarities(stars, places, corners, query, centre, gate, out):  # type: ignore[no-untyped-def]
     """Per match: x, y of the moved centre, yaw, scale (none of these if mirrored), verdict KEPT, MIRRORED or

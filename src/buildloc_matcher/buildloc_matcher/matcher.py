@@ -33,7 +33,7 @@ from buildloc_matcher.window import start
 
 FEWEST_BUILDINGS = 4
 WARM_UP_BUILDINGS = 40
-MOST_GROWN = 20000  # hypotheses of a look that matches are grown from, the likeliest
+MOST_GROWN = 10000  # hypotheses of a look that matches are grown from, the likeliest
 MOST_STARS = 4096  # of one look; those of a map of 100,000 buildings, matched, would fill 30 GB
 
 
@@ -69,7 +69,7 @@ class _Look:
 
     thinnings: int
     max_stars: int
-    pairs: int
+    places: int
     star_matcher: StarMatcher
 
 
@@ -106,7 +106,7 @@ class Matcher:
         second = replace(config, matches_per_star=config.second_look_matches)
         self._looks = [_Look(0, config.max_stars or MOST_STARS, 0, star_matcher(database.tables, config))]
         if config.second_look:
-            self._looks.append(_Look(config.second_look, MOST_STARS, config.second_look_pairs, star_matcher(database.tables, second)))
+            self._looks.append(_Look(config.second_look, MOST_STARS, config.second_look_places, star_matcher(database.tables, second)))
 
     def warm_up(self) -> None:
         """Locate and refine a piece of the reference itself: compiled code is loaded, and on a new machine
@@ -165,9 +165,9 @@ class Matcher:
                 nats = seed_evidence(query, found.corners, *seeds, reference, config)
                 voters = hypotheses.weighted(np.where(nats > 0.0, np.exp(nats), 0.0))
         corners = found.corners
-        if look.pairs:
+        if look.places:
             with clock.stage("pairs"):
-                ends, paired = pair_hypotheses(query, reference, look.pairs, config)
+                ends, paired = pair_hypotheses(query, reference, look.places, config)
             voters, corners = voters.joined(paired, len(corners)), np.concatenate([corners, ends])
         if config.votes == "evidence":
             with clock.stage("grow"):

@@ -8,8 +8,6 @@ their right places. A pair needs two. It fits in many more places, and so only a
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
-from itertools import product
 
 import numpy as np
 from buildloc_msgs_py.types import FloatArray
@@ -17,20 +15,20 @@ from numba import njit
 from numpy.typing import NDArray
 
 from buildloc_matcher.config import MatcherConfig
-from buildloc_matcher.evidence import GATE_SIGMAS, Ground, QueryMap, _seed_evidence, witnesses
-from buildloc_matcher.hypotheses import NO_HYPOTHESES, Hypotheses
-from buildloc_matcher.matching import THREADS
+from buildloc_matcher.evidence import GATE_SIGMAS, Ground, QueryMap, seed_evidence, witnesses
+from buildloc_matcher.hypotheses import Hypotheses
 from buildloc_matcher.point_grid import nearest
 
 LENGTHS_M = (15.0, 120.0)
-LENGTH_OFF_M, LENGTH_OFF = 4.0, 0.05  # how much longer or shorter it may be in the reference: m, and share
+LENGTH_OFF_M, LENGTH_OFF = 3.0, 0.03  # how much longer or shorter it may be in the reference: m, and share
 LOG_AREA_OFF = 0.6
-AT_ONCE = 1 << 16  # buildings of the reference whose pairs are in memory together
+HOPELESS = -6.0  # a pair that has sunk below this is given up: there are many
 USED_OFTEN = 2  # pairs of one building, so that not all of them fail with it
 
 
-def choose_pairs(query: QueryMap, reference: Ground, count: int) -> NDArray[np.int64]:
-    """(P, 2) buildings of the map: pairs that the reference likely has, and few others like them."""
+def choose_pairs(query: QueryMap, reference: Ground) -> NDArray[np.int64]:
+    """(P, 2) buildings of the map: pairs that the reference likely has and few others like them; the rarer building
+    of each comes first."""
     sizes, theirs = np.log(query.areas_m2), np.sort(np.log(reference.areas_m2))
     alike = np.searchsorted(theirs, sizes + LOG_AREA_OFF) - np.searchsorted(theirs, sizes - LOG_AREA_OFF)
     ends = np.array([(i, k) for i, near in enumerate(query.neighbours.tolist()) for k in near])
@@ -41,21 +39,20 @@ def choose_pairs(query: QueryMap, reference: Ground, count: int) -> NDArray[np.i
     used = np.zeros(len(query.points_m), dtype=np.int64)
     chosen = []
     for pair in ends[np.argsort(0.5 * np.log(lengths) - worth, kind="stable")]:
-        if len(chosen) < count and (used[pair] < USED_OFTEN).all():
+        if (used[pair] < USED_OFTEN).all():
             used[pair] += 1
-            chosen.append(pair)
+            chosen.append(pair[np.argsort(alike[pair])])
     return np.array(chosen, dtype=np.int64).reshape(-1, 2)
 
 
 @njit(nogil=True, cache=True)
-def _like(length, off, first, second, begin, end, points, sizes, starts, frame):  # type: ignore[no-untyped-def]
-    """(H, 2) places of the reference so far apart whose sizes are near the first and the second; the first of
-    them from ``begin`` to ``end``."""
+def _like(length, off, first, second, sizes, points, starts, frame):  # type: ignore[no-untyped-def]
+    """(H, 2) places of the reference so far apart whose sizes are near the first and the second."""
     west, south, cell, columns, rows = frame
     found, count = np.empty((1024, 2), np.int64), 0
     reach = length + off
     low, high = (length - off) ** 2, reach**2
-    for p in range(begin, end):
+    for p in range(len(points)):
         if abs(sizes[p] - first) > LOG_AREA_OFF:
             continue
         x, y = points[p, 0], points[p, 1]
@@ -97,40 +94,30 @@ def _thirds(query, pairs, others, turns, places, points, starts, frame, gate, co
 
 
 def pair_hypotheses(
-    query: QueryMap, reference: Ground, count: int, config: MatcherConfig
+    query: QueryMap, reference: Ground, most: int, config: MatcherConfig
 ) -> tuple[NDArray[np.int64], Hypotheses]:
     """Corners (H, 3) of the map, and the hypotheses with the same numbers whose surroundings speak for them,
-    of so many pairs; their votes are their likelihoods."""
-    pairs, grid = choose_pairs(query, reference, count), reference.grid
-    sizes = np.log(reference.areas_m2[grid.order].astype(np.float64))
-    others = witnesses(query, pairs, config)
-
-    where = (grid.points_m, grid.starts, grid.frame)
-
-    def work(number: int, begin: int) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
-        pair, end = pairs[number], min(begin + AT_ONCE, len(sizes))
+    of pairs that are tried in so many places at most; their votes are their likelihoods."""
+    pairs, grid = choose_pairs(query, reference), reference.grid
+    where, sizes = (grid.points_m, grid.starts, grid.frame), np.log(reference.areas_m2[grid.order])
+    tried = [np.empty((0, 2), dtype=np.int64)]
+    for pair in pairs:
         length = float(np.hypot(*(query.points_m[pair[1]] - query.points_m[pair[0]])))
-        off, (first, second) = LENGTH_OFF_M + LENGTH_OFF * length, np.log(query.areas_m2[pair])
-        like = _like(length, off, first, second, begin, end, grid.points_m, sizes, grid.starts, grid.frame)
-        numbers, nats = np.full(len(like), number), np.empty(len(like))
-        _seed_evidence(
-            query.points_m, query.shares, numbers, pairs, others, grid.points_m[like], *where,
-            reference.density_per_m2, config.sigma_m, nats,
-        )  # fmt: skip
-        good = nats > 0.0
-        return like[good], numbers[good], nats[good]
-
-    jobs = list(product(range(len(pairs)), range(0, len(sizes), AT_ONCE)))
-    if not jobs:
-        return np.empty((0, 3), dtype=np.int64), NO_HYPOTHESES
-    with ThreadPoolExecutor(THREADS) as pool:
-        found = zip(*pool.map(work, *zip(*jobs, strict=True)), strict=True)
-        places, numbers, nats = (np.concatenate(parts) for parts in found)
+        first, second = np.log(query.areas_m2[pair])
+        like = _like(length, LENGTH_OFF_M + LENGTH_OFF * length, first, second, sizes, *where)
+        if sum(map(len, tried)) + len(like) > most:
+            break
+        tried.append(like)
+    places = np.concatenate(tried)
+    numbers = np.repeat(np.arange(len(tried) - 1), [len(like) for like in tried[1:]])
+    nats = seed_evidence(query, pairs, numbers, grid.points_m[places], reference, config, HOPELESS)
+    good = nats > 0.0
+    places, numbers, nats = places[good], numbers[good], nats[good]
     ends, theirs = query.points_m[pairs[numbers]] @ (1.0, 1.0j), grid.points_m[places] @ (1.0, 1.0j)
     turns = (theirs[:, 1] - theirs[:, 0]) / (ends[:, 1] - ends[:, 0])
     corners, corner_places = np.empty((len(places), 3), dtype=np.int64), np.empty((len(places), 3, 2))
     _thirds(
-        query.points_m, pairs[numbers], others[numbers], turns, places, *where,
+        query.points_m, pairs[numbers], witnesses(query, pairs, config)[numbers], turns, places, *where,
         GATE_SIGMAS * math.sqrt(2.0) * config.sigma_m, corners, corner_places,
     )  # fmt: skip
     whole = corners[:, 2] >= 0
