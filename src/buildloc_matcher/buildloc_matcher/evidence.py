@@ -32,7 +32,7 @@ GATE_SIGMAS = 3.0
 MAX_GATE_M = 16.0
 HOPELESS = -10.0  # a hypothesis that has sunk below this is given up
 NO_MATCH = -1
-# Nobody knows how much a segmenter invents on this ground, as in snow: as likely the shares are so much lower.
+# Nobody knows how much a segmenter invents on this ground, as in snow: shares so much lower are as likely.
 DOUBT = 0.4
 FALSE_SIZE_SPREAD, SIZE_BLUR = 0.5, 0.3  # of the logarithm of areas: invented buildings; a size of the map
 LEAST_REAL = 0.1
@@ -150,7 +150,9 @@ def _either(sure, doubtful):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _seed_evidence(query, shares, stars, corners, others, places, points, starts, frame, density, sigma, hopeless, out):  # type: ignore[no-untyped-def]
+def _seed_evidence(  # type: ignore[no-untyped-def]
+    query, shares, stars, corners, others, places, points, starts, frame, density, sigma, hopeless, out
+):
     """Evidence of hypotheses: query triangle or pair ``corners[stars[h]]`` lies on ``places[h]`` (K, 2).
 
     The similarity of the corners is carried outwards over the witnesses and refitted with each that

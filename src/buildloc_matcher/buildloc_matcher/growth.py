@@ -278,7 +278,9 @@ def grow(
             continue
         state, predicted = states[len(grown)], np.empty((len(query.points_m), 2))
         start = (triangle, seats, turns[c].real, turns[c].imag)
-        nats = _grow(query.points_m, query.shares, query.neighbours, *start, *where, *settings, taken, state, predicted)
+        nats = _grow(
+            query.points_m, query.shares, query.neighbours, *start, *where, *settings, taken, state, predicted
+        )
         if nats > 0.0:
             matched = np.where(state >= 0, reference.grid.order[np.maximum(state, 0)], NO_MATCH)
             grown.append((c, Grown(matched, predicted, nats)))

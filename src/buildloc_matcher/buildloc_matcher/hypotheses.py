@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from buildloc_msgs_py.types import FloatArray
@@ -15,6 +16,7 @@ from buildloc_matcher.matching import NOTHING, Matches
 from buildloc_matcher.reference.database import ReferenceDatabase
 
 KEPT, MIRRORED, OFF_SCALE = 0.0, 1.0, 2.0
+PER_HYPOTHESIS = ("stars", "places_m", "positions_m", "yaws_rad", "scales", "weights")
 
 
 @dataclass(frozen=True)
@@ -35,28 +37,23 @@ class Hypotheses:
         return len(self.weights)
 
     def joined(self, other: Hypotheses, stars: int) -> Hypotheses:
-        """These and others, whose stars come after so many."""
-        both = ((getattr(self, name), getattr(other, name)) for name in (
-            "places_m", "positions_m", "yaws_rad", "scales", "weights"))
-        return Hypotheses(
-            np.concatenate([self.stars, other.stars + stars]), *(np.concatenate(b) for b in both),
-            mirrored=self.mirrored + other.mirrored, off_scale=self.off_scale + other.off_scale,
-        )
+        """These and others, whose stars are numbered after so many."""
+        ours, theirs = vars(self), vars(other) | {"stars": other.stars + stars}
+        both: dict[str, Any] = {n: np.concatenate([ours[n], theirs[n]]) for n in PER_HYPOTHESIS}
+        return replace(self, **both)
 
     def heaviest(self, count: int) -> Hypotheses:
         """So many with the largest votes."""
         if len(self) <= count:
             return self
-        least = np.partition(self.weights, len(self) - count)[len(self) - count]
+        least = np.partition(self.weights, -count)[-count]
         return self.weighted(np.where(self.weights >= least, self.weights, 0.0))
 
     def weighted(self, weights: FloatArray) -> Hypotheses:
         """The hypotheses whose new vote is positive."""
         kept = weights > 0.0
-        return replace(
-            self, stars=self.stars[kept], places_m=self.places_m[kept], positions_m=self.positions_m[kept],
-            yaws_rad=self.yaws_rad[kept], scales=self.scales[kept], weights=weights[kept],
-        )  # fmt: skip
+        some: dict[str, Any] = {name: vars(self)[name][kept] for name in PER_HYPOTHESIS}
+        return replace(self, **some | {"weights": weights[kept]})
 
 
 @njit(nogil=True, cache=True)

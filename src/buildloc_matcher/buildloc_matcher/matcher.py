@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from buildloc_msgs_py.types import Candidate, Fix, FloatArray, FrameObservation, Keyframe, LocalMap, NoFix
+from numpy.typing import NDArray
 
 from buildloc_matcher.acceptance import Outcome, Verdict, judge_candidate, lead, log_odds, score
 from buildloc_matcher.acquisition import NotAcquired, acquire
@@ -18,7 +19,7 @@ from buildloc_matcher.evidence import QueryMap, query_map, seed_evidence
 from buildloc_matcher.follow import Followed, follow
 from buildloc_matcher.geometry import Similarity, wrap
 from buildloc_matcher.growth import grown_nats
-from buildloc_matcher.hypotheses import hypothesize
+from buildloc_matcher.hypotheses import Hypotheses, hypothesize
 from buildloc_matcher.local_map import check_map
 from buildloc_matcher.match_cache import MakeStarMatcher, MatchCache, StarMatcher
 from buildloc_matcher.mesh import Mesh, mesh
@@ -106,7 +107,14 @@ class Matcher:
         second = replace(config, matches_per_star=config.second_look_matches)
         self._looks = [_Look(0, config.max_stars or MOST_STARS, 0, star_matcher(database.tables, config))]
         if config.second_look:
-            self._looks.append(_Look(config.second_look, MOST_STARS, config.second_look_places, star_matcher(database.tables, second)))
+            self._looks.append(
+                _Look(
+                    config.second_look,
+                    MOST_STARS,
+                    config.second_look_places,
+                    star_matcher(database.tables, second),
+                )
+            )
 
     def warm_up(self) -> None:
         """Locate and refine a piece of the reference itself: compiled code is loaded, and on a new machine
@@ -117,6 +125,9 @@ class Matcher:
         ids = np.arange(len(some), dtype=np.int64)
         areas, shapes = some.areas_m2.astype(np.float64), some.shapes.astype(np.float64)
         self.locate(LocalMap.whole(0, ids, some.centroids_m, areas, shapes, np.ones_like(ids)))
+        if self.config.second_look:  # which that first look has hardly asked for
+            query = query_map(some.centroids_m, areas, self.config)
+            pair_hypotheses(query, self.database.ground, self.config.second_look_places, self.config)
         level = some.centroids_m - buildings.centroids_m[0]
         outlines = None if some.outlines is None else level[:, None] + OUTLINE_UNIT_M * some.outlines
         here = Similarity((0.0, 0.0), (buildings.centroids_m[0, 0], buildings.centroids_m[0, 1]), 0.0)
@@ -159,22 +170,9 @@ class Matcher:
         with clock.stage("hypothesize"):
             hypotheses = hypothesize(matches, found.corners, query.points_m, self.database, centre, config)
         with clock.stage("vote"):
-            voters = hypotheses
+            voters, corners = hypotheses, found.corners
             if config.votes == "evidence":
-                seeds = (hypotheses.stars, hypotheses.places_m)
-                nats = seed_evidence(query, found.corners, *seeds, reference, config)
-                voters = hypotheses.weighted(np.where(nats > 0.0, np.exp(nats), 0.0))
-        corners = found.corners
-        if look.places:
-            with clock.stage("pairs"):
-                ends, paired = pair_hypotheses(query, reference, look.places, config)
-            voters, corners = voters.joined(paired, len(corners)), np.concatenate([corners, ends])
-        if config.votes == "evidence":
-            with clock.stage("grow"):
-                likeliest = voters.heaviest(MOST_GROWN)
-                nats = grown_nats(query, corners[likeliest.stars], likeliest.places_m, reference, config)
-                voters = likeliest.weighted(np.where(nats > 0.0, np.exp(nats), 0.0))
-        with clock.stage("vote"):
+                voters, corners = self._weighed(hypotheses, corners, query, look.places)
             ballot = vote(voters, config)
         with clock.stage("select"):
             selected = select(ballot, voters, corners, query, reference, config)
@@ -201,6 +199,21 @@ class Matcher:
             funnel["log_odds"] = candidates[0].acceptance
             funnel["score"] = score(candidates[0], rivals, config)
         return MatchResult(candidates, scores, rivals, ballot.places_m, query, funnel, clock.seconds)
+
+    def _weighed(
+        self, hypotheses: Hypotheses, corners: NDArray[np.int64], query: QueryMap, places: int
+    ) -> tuple[Hypotheses, NDArray[np.int64]]:
+        """Hypotheses that vote with the likelihood of the match that grows from each, and the map's corners
+        that they number: those given with stars (S, 3), and those of pairs tried in so many places."""
+        config, reference = self.config, self.database.ground
+        nats = seed_evidence(query, corners, hypotheses.stars, hypotheses.places_m, reference, config)
+        voters = hypotheses.weighted(np.where(nats > 0.0, np.exp(nats), 0.0))
+        if places:
+            ends, paired = pair_hypotheses(query, reference, places, config)
+            voters, corners = voters.joined(paired, len(corners)), np.concatenate([corners, ends])
+        voters = voters.heaviest(MOST_GROWN)
+        nats = grown_nats(query, corners[voters.stars], voters.places_m, reference, config)
+        return voters.weighted(np.where(nats > 0.0, np.exp(nats), 0.0)), corners
 
     def _candidate(self, cluster: Cluster, score: Score, centre: FloatArray, query: QueryMap) -> Candidate:
         near = local_transform(score, centre, query, self.database.ground, self.config)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from buildloc_msgs_py.types import FloatArray
 from numba import njit
 from numpy.typing import NDArray
 
@@ -27,8 +26,8 @@ USED_OFTEN = 2  # pairs of one building, so that not all of them fail with it
 
 
 def choose_pairs(query: QueryMap, reference: Ground) -> NDArray[np.int64]:
-    """(P, 2) buildings of the map: pairs that the reference likely has and few others like them; the rarer building
-    of each comes first."""
+    """(P, 2) buildings of the map: pairs that the reference likely has, and few others like them, first; of
+    each the rarer building."""
     sizes, theirs = np.log(query.areas_m2), np.sort(np.log(reference.areas_m2))
     alike = np.searchsorted(theirs, sizes + LOG_AREA_OFF) - np.searchsorted(theirs, sizes - LOG_AREA_OFF)
     ends = np.array([(i, k) for i, near in enumerate(query.neighbours.tolist()) for k in near])

@@ -105,7 +105,9 @@ def vote(hypotheses: Hypotheses, config: MatcherConfig) -> Ballot:
     consistent = table[table[:, 5] >= config.min_votes]
     ranked: FloatArray = consistent[np.lexsort((consistent[:, 1], consistent[:, 0], -consistent[:, 4]))]
     clusters = tuple(
-        Cluster(x, y, yaw, scale, votes, int(members), tuple(int(order[int(row)]) for row in seeds if row >= 0))
+        Cluster(
+            x, y, yaw, scale, votes, int(members), tuple(int(order[int(row)]) for row in seeds if row >= 0)
+        )
         for x, y, yaw, scale, votes, members, *seeds in ranked[: config.top_k].tolist()
     )
     return Ballot(clusters, len(table), ranked[:, :2])
