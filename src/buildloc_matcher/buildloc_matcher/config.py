@@ -45,7 +45,7 @@ class MatcherConfig:
     )
     second_look_matches: int = param(500, "matches_per_star of the second look", 1, 10000)
     second_look_places: int = param(
-        500_000, "places where the second look tries pairs of buildings, at most; 0: none", 0, 100_000_000
+        200_000, "places where the second look tries pairs of buildings, at most; 0: none", 0, 100_000_000
     )
     scale_gate: float = param(0.15, "largest deviation of the map-to-world scale from 1", 0.0, 0.9)
     sigma_m: float = param(2.0, "error of a map building against its neighbours, per axis, m", 0.1, 50.0)

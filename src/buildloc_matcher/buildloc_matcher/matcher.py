@@ -34,7 +34,7 @@ from buildloc_matcher.window import start
 
 FEWEST_BUILDINGS = 4
 WARM_UP_BUILDINGS = 40
-MOST_GROWN = 10000  # hypotheses of a look that matches are grown from, the likeliest
+MOST_GROWN = 4000  # hypotheses of a look that matches are grown from, the likeliest
 MOST_STARS = 4096  # of one look; those of a map of 100,000 buildings, matched, would fill 30 GB
 
 

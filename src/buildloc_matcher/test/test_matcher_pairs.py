@@ -124,6 +124,6 @@ def test_sparse_maps_are_found_by_pairs_where_stars_find_nothing() -> None:
             located(Matcher(database, matcher_config({"second_look_places": places})), *flight) < 20.0
             for flight in flights
         )
-        for places in (0, 500_000)
+        for places in (0, 200_000)
     }
-    assert right[0] <= 2 and right[500_000] >= 5
+    assert right[0] <= 2 and right[200_000] >= 5
