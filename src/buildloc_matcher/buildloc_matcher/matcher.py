@@ -34,7 +34,8 @@ from buildloc_matcher.window import start
 
 FEWEST_BUILDINGS = 4
 WARM_UP_BUILDINGS = 40
-MOST_GROWN = 4000  # hypotheses of a look that matches are grown from, the likeliest
+MOST_GROWN = 400_000  # buildings of the matches that grow from hypotheses in a look
+SPARSE = 100  # buildings; a map of more has stars enough
 MOST_STARS = 4096  # of one look; those of a map of 100,000 buildings, matched, would fill 30 GB
 
 
@@ -208,10 +209,10 @@ class Matcher:
         config, reference = self.config, self.database.ground
         nats = seed_evidence(query, corners, hypotheses.stars, hypotheses.places_m, reference, config)
         voters = hypotheses.weighted(np.where(nats > 0.0, np.exp(nats), 0.0))
-        if places:
+        if places and len(query.points_m) <= SPARSE:
             ends, paired = pair_hypotheses(query, reference, places, config)
             voters, corners = voters.joined(paired, len(corners)), np.concatenate([corners, ends])
-        voters = voters.heaviest(MOST_GROWN)
+        voters = voters.heaviest(MOST_GROWN // len(query.points_m))
         nats = grown_nats(query, corners[voters.stars], voters.places_m, reference, config)
         return voters.weighted(np.where(nats > 0.0, np.exp(nats), 0.0)), corners
 
