@@ -88,6 +88,8 @@ ABLATIONS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
         "votes by score": {"votes": "score"},
         "rigid selection": {"selection": "rigid"},
         "no second look": {"second_look": 0},
+        "no pairs in the second look": {"second_look_places": 0},
+        "no building is invented": {"false_per_km2": 0.0},
         "all stars at first": {"max_stars": 0},
         "half the matches per star": {"matches_per_star": 50, "second_look_matches": 250},
         "20 candidates": {"top_k": 20},
