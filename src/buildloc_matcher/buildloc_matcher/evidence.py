@@ -12,14 +12,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-import shapely
 from buildloc_msgs_py.types import FloatArray
 from numba import njit
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import gaussian_filter1d, uniform_filter
 from scipy.spatial import cKDTree
 
 from buildloc_matcher.config import MatcherConfig
+from buildloc_matcher.geometry import area_around_m2
 from buildloc_matcher.matching import THREADS
 from buildloc_matcher.point_grid import PointGrid, grid_points, nearest
 
@@ -34,7 +34,8 @@ HOPELESS = -10.0  # a hypothesis that has sunk below this is given up
 NO_MATCH = -1
 # Nobody knows how much a segmenter invents on this ground, as in snow: shares so much lower are as likely.
 DOUBT = 0.4
-FALSE_SIZE_SPREAD, SIZE_BLUR = 0.5, 0.3  # of the logarithm of areas: invented buildings; a size of the map
+# Of the logarithm of areas: spread of invented buildings; how wide a size of the map is; step of a histogram.
+FALSE_SIZE_SPREAD, SIZE_BLUR, SIZE_STEP = 0.5, 0.3, 0.02
 LEAST_REAL = 0.1
 FEWEST_AREAS = 4
 MAX_AREA_BIAS = 0.5
@@ -92,9 +93,11 @@ def shares_of(points_m: FloatArray, areas_m2: FloatArray, config: MatcherConfig)
     So many are invented on the ground that was seen, about ``false_area_m2`` large. Where the map has hardly
     more buildings of a size than that, most of them are invented; in a town of small houses few are.
     """
-    seen_m2 = shapely.MultiPoint(points_m).buffer(config.observable_radius_m).area
-    sizes = np.log(areas_m2)
-    found = _normal(sizes[:, None] - sizes, SIZE_BLUR).sum(axis=1)
+    seen_m2, sizes = area_around_m2(points_m, config.observable_radius_m), np.log(areas_m2)
+    low = float(sizes.min()) - 0.5 * SIZE_STEP
+    counts = np.bincount(((sizes - low) / SIZE_STEP).astype(np.int64))
+    blurred = gaussian_filter1d(counts.astype(float), SIZE_BLUR / SIZE_STEP, mode="constant") / SIZE_STEP
+    found = np.interp(sizes, low + (0.5 + np.arange(len(counts))) * SIZE_STEP, blurred)
     spread = math.hypot(FALSE_SIZE_SPREAD, SIZE_BLUR)
     invented = config.false_per_km2 * 1e-6 * seen_m2 * _normal(sizes - math.log(config.false_area_m2), spread)
     return np.asarray(config.match_share * np.clip(1.0 - invented / found, LEAST_REAL, 1.0))

@@ -19,14 +19,13 @@ from scipy.special import logsumexp
 from buildloc_matcher.acceptance import Outcome, refuse_refined
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.evidence import GATE_SIGMAS, Ground, placed_evidence
-from buildloc_matcher.geometry import Similarity, rotation, wrap
+from buildloc_matcher.geometry import Similarity, area_around_m2, rotation, wrap
 from buildloc_matcher.pursuit import Agreement, Pose, sigma_m, sigmas_apart
 from buildloc_matcher.refinement import Refined, Unrefined, refine, registration_covariance
 from buildloc_matcher.window import start
 
 SIGMAS = 3.0  # the uncertainty of a prediction reaches this far
 ONE_BUILDING_M = 6.0  # buildings of two frames nearer than this are the same
-AREA_CELL_M = 10.0
 
 
 @dataclass(frozen=True)
@@ -82,16 +81,7 @@ def seen_in_world(
         apart = np.linalg.norm(points[:, None] - seen[None], axis=2)
         seen = np.concatenate([seen, points[(apart > ONE_BUILDING_M).all(axis=1)]])
     path = np.array([poses[o.stamp_ns][:2] for o in placed]).reshape(-1, 2)
-    return Seen(seen, _around_m2(path, config.observable_radius_m))
-
-
-def _around_m2(path_m: FloatArray, radius_m: float) -> float:
-    """Area of the ground within a radius of any place (N, 2), m2, by cells."""
-    line = np.arange(-radius_m, radius_m, AREA_CELL_M) + 0.5 * AREA_CELL_M
-    disc = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-    disc = disc[np.linalg.norm(disc, axis=1) <= radius_m]
-    cells = np.floor((path_m[:, None] + disc).reshape(-1, 2) / AREA_CELL_M)
-    return len(np.unique(cells, axis=0)) * AREA_CELL_M**2
+    return Seen(seen, area_around_m2(path, config.observable_radius_m))
 
 
 def _shifts(sigma: float, config: MatcherConfig) -> FloatArray:

@@ -36,6 +36,7 @@ FEWEST_BUILDINGS = 4
 WARM_UP_BUILDINGS = 40
 MOST_GROWN = 400_000  # buildings of the matches that grow from hypotheses in a look
 SPARSE = 100  # buildings; a map of more has stars enough
+BEYOND_DOUBT = 600.0
 MOST_STARS = 4096  # of one look; those of a map of 100,000 buildings, matched, would fill 30 GB
 
 
@@ -73,6 +74,11 @@ class _Look:
     max_stars: int
     places: int
     star_matcher: StarMatcher
+
+
+def _likelihoods(nats: FloatArray) -> FloatArray:
+    """Votes of evidence above 0; what is beyond all doubt ties, since larger numbers overflow."""
+    return np.where(nats > 0.0, np.exp(np.minimum(nats, BEYOND_DOUBT)), 0.0)
 
 
 class _Clock:
@@ -126,7 +132,7 @@ class Matcher:
         ids = np.arange(len(some), dtype=np.int64)
         areas, shapes = some.areas_m2.astype(np.float64), some.shapes.astype(np.float64)
         self.locate(LocalMap.whole(0, ids, some.centroids_m, areas, shapes, np.ones_like(ids)))
-        if self.config.second_look:  # which that first look has hardly asked for
+        if self.config.second_look and len(some) >= FEWEST_BUILDINGS:  # hardly asked for by that first look
             query = query_map(some.centroids_m, areas, self.config)
             pair_hypotheses(query, self.database.ground, self.config.second_look_places, self.config)
         level = some.centroids_m - buildings.centroids_m[0]
@@ -208,13 +214,13 @@ class Matcher:
         that they number: those given with stars (S, 3), and those of pairs tried in so many places."""
         config, reference = self.config, self.database.ground
         nats = seed_evidence(query, corners, hypotheses.stars, hypotheses.places_m, reference, config)
-        voters = hypotheses.weighted(np.where(nats > 0.0, np.exp(nats), 0.0))
+        voters = hypotheses.weighted(_likelihoods(nats))
         if places and len(query.points_m) <= SPARSE:
             ends, paired = pair_hypotheses(query, reference, places, config)
             voters, corners = voters.joined(paired, len(corners)), np.concatenate([corners, ends])
         voters = voters.heaviest(MOST_GROWN // len(query.points_m))
         nats = grown_nats(query, corners[voters.stars], voters.places_m, reference, config)
-        return voters.weighted(np.where(nats > 0.0, np.exp(nats), 0.0)), corners
+        return voters.weighted(_likelihoods(nats)), corners
 
     def _candidate(self, cluster: Cluster, score: Score, centre: FloatArray, query: QueryMap) -> Candidate:
         near = local_transform(score, centre, query, self.database.ground, self.config)
