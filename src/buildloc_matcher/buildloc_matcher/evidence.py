@@ -114,8 +114,8 @@ def query_map(points_m: FloatArray, areas_m2: FloatArray, config: MatcherConfig)
 
 
 def witnesses(query: QueryMap, triangles: NDArray[np.int64], config: MatcherConfig) -> NDArray[np.int64]:
-    """(S, WITNESSES) buildings of the map nearest to each triangle or pair (S, K), its corners left out, and
-    those that are more likely invented than not; NO_MATCH pads."""
+    """(S, W) buildings of the map, WITNESSES at most, nearest to each triangle or pair (S, K), its corners
+    left out, and those that are more likely invented than not; NO_MATCH pads."""
     likely = np.flatnonzero(query.shares >= 0.5 * config.match_share)
     if not len(triangles) or not len(likely):
         return np.full((len(triangles), WITNESSES), NO_MATCH, dtype=np.int64)
@@ -147,7 +147,7 @@ def _gain(squared, variance, gate, density, share):  # type: ignore[no-untyped-d
 
 @njit(nogil=True, cache=True, inline="always")
 def _either(sure, doubtful):  # type: ignore[no-untyped-def]
-    """Evidence where the shares are as likely right as DOUBT times too high."""
+    """Evidence where the shares are as likely DOUBT of what they seem as right."""
     high = max(sure, doubtful)
     return high + math.log(0.5 * math.exp(sure - high) + 0.5 * math.exp(doubtful - high))
 

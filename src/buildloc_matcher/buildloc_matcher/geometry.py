@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from buildloc_msgs_py.types import FloatArray
 
-AREA_CELL_M = 10.0
+CELLS = 6  # across the radius of an area
 
 
 def rotation(yaw_rad: float) -> FloatArray:
@@ -65,9 +65,10 @@ def fit_similarity(
 
 def area_around_m2(points_m: FloatArray, radius_m: float) -> float:
     """Area of the ground within a radius of any point (N, 2), m2, by cells."""
-    line = np.arange(-radius_m, radius_m, AREA_CELL_M) + 0.5 * AREA_CELL_M
+    cell = radius_m / CELLS
+    line = (np.arange(-CELLS, CELLS) + 0.5) * cell
     disc = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     disc = disc[np.linalg.norm(disc, axis=1) <= radius_m]
-    cells = np.floor((points_m[:, None] + disc).reshape(-1, 2) / AREA_CELL_M).astype(np.int64)
+    cells = np.floor((points_m[:, None] + disc).reshape(-1, 2) / cell).astype(np.int64)
     cells -= cells.min(axis=0, initial=0)
-    return len(np.unique(cells @ (1, 1 + cells[:, 0].max(initial=0)))) * AREA_CELL_M**2
+    return len(np.unique(cells @ (1, 1 + cells[:, 0].max(initial=0)))) * cell**2

@@ -37,6 +37,7 @@ WARM_UP_BUILDINGS = 40
 MOST_GROWN = 400_000  # buildings of the matches that grow from hypotheses in a look
 SPARSE = 100  # buildings; a map of more has stars enough
 BEYOND_DOUBT = 600.0
+LEAST_AREA_M2 = 1e-3  # of a building that has a size at all
 MOST_STARS = 4096  # of one look; those of a map of 100,000 buildings, matched, would fill 30 GB
 
 
@@ -150,7 +151,7 @@ class Matcher:
         """
         check_map(local_map)
         config, clock = self.config, _Clock()
-        usable = (local_map.areas_m2 >= config.min_area_m2) & ~local_map.cut
+        usable = (local_map.areas_m2 >= max(config.min_area_m2, LEAST_AREA_M2)) & ~local_map.cut
         points, areas, shapes = (
             local_map.centroids_m[usable],
             local_map.areas_m2[usable],
@@ -218,7 +219,7 @@ class Matcher:
         if places and len(query.points_m) <= SPARSE:
             ends, paired = pair_hypotheses(query, reference, places, config)
             voters, corners = voters.joined(paired, len(corners)), np.concatenate([corners, ends])
-        voters = voters.heaviest(MOST_GROWN // len(query.points_m))
+        voters = voters.heaviest(max(config.top_k, MOST_GROWN // len(query.points_m)))
         nats = grown_nats(query, corners[voters.stars], voters.places_m, reference, config)
         return voters.weighted(_likelihoods(nats)), corners
 

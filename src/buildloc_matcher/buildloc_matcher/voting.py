@@ -62,7 +62,7 @@ def _consistent(yaws, weights, begin, end, tolerance):  # type: ignore[no-untype
 @njit(nogil=True, cache=True)
 def _clusters(starts, positions, yaws, scales, weights, tolerance, out):  # type: ignore[no-untyped-def]
     """Per bin: x, y, yaw, scale, votes, members of its heaviest rotation-consistent set, and its SEEDS
-    heaviest rows (-1 pads), heaviest first; the first wins ties."""
+    heaviest rows (-1 pads), heaviest first."""
     for b in range(len(starts) - 1):
         centre = _consistent(yaws, weights, starts[b], starts[b + 1], tolerance)
         x, y, scale, c, s, votes, members = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0

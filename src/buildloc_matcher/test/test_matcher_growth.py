@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from buildloc_matcher.evidence import NO_MATCH
 from buildloc_matcher.geometry import fit_similarity, rotation
-from buildloc_matcher.growth import Grown, grow
+from buildloc_matcher.growth import Grown, grow, grown_nats
 from buildloc_msgs_py.types import FloatArray
 from scipy.spatial import cKDTree
 from towns import DEFAULT, alike, bent, mapped, strip, town
@@ -145,3 +145,14 @@ def test_a_part_that_nothing_connects_to_the_seed_is_never_reached() -> None:
     count = len(SEEN)
     assert np.isnan(grown.predicted_m[count:]).all() and np.all(grown.matches[count:] == NO_MATCH)
     assert np.mean(grown.matches[:count] == ROWS) > 0.95 and math.isfinite(grown.evidence)
+
+
+def test_evidence_of_many_seeds_is_that_of_each_match() -> None:
+    query = mapped(bent_map())
+    corners = np.array([[40, 41, 42], [0, 1, 2], [40, 42, 41]])
+    places = SEEN.centroids_m[[[40, 41, 42], [0, 1, 2], [7, 30, 55]]]
+    nats = grown_nats(query, corners, places, GROUND, DEFAULT)
+    alone = [grow(query, corners[k : k + 1], places[k : k + 1], GROUND, DEFAULT) for k in range(3)]
+    expected = [match[0][1].evidence if match else 0.0 for match in alone]
+    assert np.maximum(nats, 0.0) == pytest.approx(expected)
+    assert expected[0] > 50.0
