@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.evidence import GATE_SIGMAS, Ground, QueryMap, seed_evidence, witnesses
 from buildloc_matcher.hypotheses import Hypotheses
-from buildloc_matcher.point_grid import nearest
+from buildloc_matcher.point_grid import _reach, nearest
 
 LENGTHS_M = (15.0, 120.0)
 LENGTH_OFF_M, LENGTH_OFF = 3.0, 0.03  # how much longer or shorter it may be in the reference: m, and share
@@ -47,7 +47,6 @@ def choose_pairs(query: QueryMap, reference: Ground) -> NDArray[np.int64]:
 @njit(nogil=True, cache=True)
 def _like(length, off, first, second, sizes, points, starts, frame):  # type: ignore[no-untyped-def]
     """(H, 2) places of the reference so far apart whose sizes are near the first and the second."""
-    west, south, cell, columns, rows = frame
     found, count = np.empty((1024, 2), np.int64), 0
     reach = length + off
     low, high = (length - off) ** 2, reach**2
@@ -55,12 +54,10 @@ def _like(length, off, first, second, sizes, points, starts, frame):  # type: ig
         if abs(sizes[p] - first) > LOG_AREA_OFF:
             continue
         x, y = points[p, 0], points[p, 1]
-        first_column = max(0, math.floor((x - reach - west) / cell))
-        last_column = min(columns - 1, math.floor((x + reach - west) / cell))
-        first_row = max(0, math.floor((y - reach - south) / cell))
-        last_row = min(rows - 1, math.floor((y + reach - south) / cell))
+        first_column, last_column, first_row, last_row = _reach(frame, x, y, reach)
         for row in range(first_row, last_row + 1):
-            for q in range(starts[row * columns + first_column], starts[row * columns + last_column + 1]):
+            begin = row * frame[3]
+            for q in range(starts[begin + first_column], starts[begin + last_column + 1]):
                 if abs(sizes[q] - second) > LOG_AREA_OFF:
                     continue
                 squared = (points[q, 0] - x) ** 2 + (points[q, 1] - y) ** 2

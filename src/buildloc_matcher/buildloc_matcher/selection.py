@@ -129,17 +129,17 @@ def select(
         return sorted(rigid, key=lambda pair: (-pair[1].jaccard, -pair[0].votes))
     if not ballot.clusters:
         return []
-    rows = [(c, row) for c, cluster in enumerate(ballot.clusters) for row in cluster.seeds]
-    of, best = np.array(rows).T
+    clusters = [cluster for cluster in ballot.clusters for _ in cluster.seeds]
+    best = [row for cluster in ballot.clusters for row in cluster.seeds]
     seeds, places = corners[voters.stars[best]], voters.places_m[best]
     grown = grow(query, seeds, places, reference, config)
     listed: list[_Listed] = []
     tested: set[int] = set()
     while True:
-        _list(grown, listed, [ballot.clusters[c] for c in of], query, reference, config)
+        _list(grown, listed, clusters, query, reference, config)
         first = listed[0].seed if listed else -1
         if first < 0 or first in tested:
-            return [(ballot.clusters[of[one.seed]], one.score) for one in listed]
+            return [(clusters[one.seed], one.score) for one in listed]
         tested.add(first)
         moved = shifted(places[first], reference, config)
         corner = np.repeat(seeds[first : first + 1], len(moved), axis=0)

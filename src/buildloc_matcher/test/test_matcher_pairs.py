@@ -43,13 +43,13 @@ def sparse_flight(seed: int, real: int, invented: int) -> tuple[FloatArray, Floa
     return np.column_stack([seen.real, seen.imag]) + MOVED_M, areas, true
 
 
-def plan_of(points_m: FloatArray, areas_m2: FloatArray) -> QueryMap:
+def query_of(points_m: FloatArray, areas_m2: FloatArray) -> QueryMap:
     return query_map(points_m, areas_m2, DEFAULT)
 
 
 def test_pairs_are_of_neighbours_and_no_building_is_in_many() -> None:
     points, areas, _ = sparse_flight(1, 18, 12)
-    pairs = choose_pairs(plan_of(points, areas), GROUND)
+    pairs = choose_pairs(query_of(points, areas), GROUND)
     assert len(pairs) > 12 and len(np.unique(np.sort(pairs, axis=1), axis=0)) == len(pairs)
     lengths = np.hypot(*(points[pairs[:, 0]] - points[pairs[:, 1]]).T)
     assert lengths.min() >= LENGTHS_M[0] and lengths.max() <= LENGTHS_M[1]
@@ -60,7 +60,7 @@ def test_rare_and_real_buildings_come_first() -> None:
     points, areas = np.random.default_rng(2).uniform(0.0, 300.0, (12, 2)), np.full(12, 100.0)
     points[:2] = (150.0, 150.0), (150.0, 190.0)
     areas[:2] = 390.0, 300.0  # few of the city are so large
-    assert choose_pairs(plan_of(points, areas), GROUND)[0].tolist() == [0, 1]
+    assert choose_pairs(query_of(points, areas), GROUND)[0].tolist() == [0, 1]
 
 
 def test_those_alike_are_all_that_comparing_every_pair_finds() -> None:
@@ -80,7 +80,7 @@ def test_those_alike_are_all_that_comparing_every_pair_finds() -> None:
 
 def test_hypotheses_lie_where_their_corners_do() -> None:
     points, areas, true = sparse_flight(3, 18, 12)
-    query = plan_of(points, areas)
+    query = query_of(points, areas)
     corners, found = pair_hypotheses(query, GROUND, 100_000, DEFAULT)
     assert len(found) == len(corners) > 0 and (found.weights > 1.0).all()
     assert found.stars.tolist() == list(range(len(found)))
@@ -94,13 +94,13 @@ def test_hypotheses_lie_where_their_corners_do() -> None:
 
 def test_maps_without_pairs_have_no_hypotheses() -> None:
     apart = np.arange(6)[:, None] * np.array([[500.0, 0.0]])
-    corners, found = pair_hypotheses(plan_of(apart, np.full(6, 150.0)), GROUND, 100_000, DEFAULT)
+    corners, found = pair_hypotheses(query_of(apart, np.full(6, 150.0)), GROUND, 100_000, DEFAULT)
     assert corners.shape == (0, 3) and len(found) == 0
 
 
 def test_no_more_places_are_tried_than_asked_for() -> None:
     points, areas, _ = sparse_flight(3, 18, 12)
-    query = plan_of(points, areas)
+    query = query_of(points, areas)
     counts = [len(pair_hypotheses(query, GROUND, most, DEFAULT)[1]) for most in (0, 5_000, 100_000)]
     assert counts[0] == 0 < counts[1] < counts[2]
 
