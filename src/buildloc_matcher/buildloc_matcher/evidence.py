@@ -17,6 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, uniform_filter
 from scipy.spatial import cKDTree
+from scipy.special import ndtr
 
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.geometry import area_around_m2
@@ -32,12 +33,15 @@ GATE_SIGMAS = 3.0
 MAX_GATE_M = 16.0
 HOPELESS = -10.0  # a hypothesis that has sunk below this is given up
 NO_MATCH = -1
+TOUCHING_M = 0.01
 # Nobody knows how much a segmenter invents on this ground, as in snow: shares so much lower are as likely.
 DOUBT = 0.4
 # Of the logarithm of areas: spread of invented buildings; how wide a size of the map is; step of a histogram.
 FALSE_SIZE_SPREAD, SIZE_BLUR, SIZE_STEP = 0.5, 0.3, 0.02
 LEAST_REAL = 0.1
+LEAST_AREA_M2 = 1e-3  # of a building that has a size at all
 FEWEST_AREAS = 4
+AREA_BIAS_SPREAD = 0.2  # how far all areas of a map may be off by the same factor, as a logarithm
 MAX_AREA_BIAS = 0.5
 MIN_AREA_SPREAD = 0.3
 MOST_CHANCE = 0.9
@@ -46,25 +50,38 @@ MOST_CHANCE = 0.9
 @dataclass(frozen=True)
 class Ground:
     """The buildings of the reference (N, 2) and their areas (N,), the same places in a grid, how dense they
-    lie: (rows, columns) in cells of DENSITY_CELL_M; and their outlines as ``Buildings`` has them, or None."""
+    lie: (rows, columns) in cells of DENSITY_CELL_M; in the order of the grid the logarithms of the areas
+    (N,) and how usual each is around it (N,), as a density; and their outlines as ``Buildings`` has them, or
+    None."""
 
     buildings_m: FloatArray
     areas_m2: NDArray[np.floating]
     grid: PointGrid
     density_per_m2: FloatArray
+    sizes: FloatArray
+    usual: FloatArray
     outlines: NDArray[np.int16] | None = None
 
 
 def ground(
     buildings_m: FloatArray, areas_m2: NDArray[np.floating], outlines: NDArray[np.int16] | None = None
 ) -> Ground:
-    """Buildings (N, 2) with areas (N,) in a grid; the density is averaged over three by three cells."""
+    """Buildings (N, 2) with areas (N,) in a grid; the density is averaged over three by three cells, and so
+    are the areas."""
     grid = grid_points(buildings_m)
     column, row = ((grid.points_m - (grid.west_m, grid.south_m)) // DENSITY_CELL_M).astype(np.int64).T
-    counts = np.zeros((row.max() + 1, column.max() + 1))
-    np.add.at(counts, (row, column), 1.0)
-    mean = uniform_filter(counts, DENSITY_CELLS, mode="constant") / DENSITY_CELL_M**2
-    return Ground(buildings_m, areas_m2, grid, np.maximum(mean, MIN_DENSITY_PER_M2), outlines)
+    sizes = np.log(np.maximum(areas_m2[grid.order].astype(np.float64), LEAST_AREA_M2))
+
+    def around(values: FloatArray) -> FloatArray:
+        summed = np.zeros((row.max() + 1, column.max() + 1))
+        np.add.at(summed, (row, column), values)
+        return np.asarray(uniform_filter(summed, DENSITY_CELLS, mode="constant"))
+
+    count = around(np.ones(len(sizes)))
+    mean, squared = (around(values)[row, column] / count[row, column] for values in (sizes, sizes**2))
+    spread = np.sqrt(np.maximum(squared - mean**2, MIN_AREA_SPREAD**2))
+    density = np.maximum(count / DENSITY_CELL_M**2, MIN_DENSITY_PER_M2)
+    return Ground(buildings_m, areas_m2, grid, density, sizes, _normal(sizes - mean, spread), outlines)
 
 
 def density_at(points_m: FloatArray, reference: Ground) -> FloatArray:
@@ -77,11 +94,13 @@ def density_at(points_m: FloatArray, reference: Ground) -> FloatArray:
 
 @dataclass(frozen=True)
 class QueryMap:
-    """Buildings of the map (N, 2) metres, their areas (N,), with what probability the reference has each of
-    them (N,), and of each its nearest others (N, NEIGHBOURS), nearest first."""
+    """Buildings of the map (N, 2) metres, their areas (N,) and the logarithms of these, with what probability
+    the reference has each of them (N,), and of each its nearest others (N, NEIGHBOURS): those that are more
+    likely in the reference than invented, then others, nearest first."""
 
     points_m: FloatArray
     areas_m2: FloatArray
+    sizes: FloatArray
     shares: FloatArray
     neighbours: NDArray[np.int64]
 
@@ -99,18 +118,36 @@ def shares_of(points_m: FloatArray, areas_m2: FloatArray, config: MatcherConfig)
     blurred = gaussian_filter1d(counts.astype(float), SIZE_BLUR / SIZE_STEP, mode="constant") / SIZE_STEP
     found = np.interp(sizes, low + (0.5 + np.arange(len(counts))) * SIZE_STEP, blurred)
     spread = math.hypot(FALSE_SIZE_SPREAD, SIZE_BLUR)
-    invented = config.false_per_km2 * 1e-6 * seen_m2 * _normal(sizes - math.log(config.false_area_m2), spread)
+    off = sizes - math.log(config.false_area_m2)
+    # The blur is of buildings that are large enough for the map: of smaller ones none comes from there.
+    least = math.log(max(config.min_area_m2, 1e-9) / config.false_area_m2)
+    large = ndtr((off * (FALSE_SIZE_SPREAD / spread) ** 2 - least) * spread / (FALSE_SIZE_SPREAD * SIZE_BLUR))
+    invented = config.false_per_km2 * 1e-6 * seen_m2 * _normal(off, spread) * large
     return np.asarray(config.match_share * np.clip(1.0 - invented / found, LEAST_REAL, 1.0))
 
 
 def query_map(points_m: FloatArray, areas_m2: FloatArray, config: MatcherConfig) -> QueryMap:
     """The map's buildings with their neighbourhoods; N >= 2."""
-    count = min(NEIGHBOURS, len(points_m) - 1)
-    _, near = cKDTree(points_m).query(points_m, k=count + 1)
+    shares = shares_of(points_m, areas_m2, config)
     return QueryMap(
-        np.ascontiguousarray(points_m), areas_m2, shares_of(points_m, areas_m2, config),
-        np.ascontiguousarray(near[:, 1:].astype(np.int64)),
+        np.ascontiguousarray(points_m), areas_m2, np.log(areas_m2), shares,
+        _neighbours(points_m, shares >= 0.5 * config.match_share),
     )  # fmt: skip
+
+
+def _neighbours(points_m: FloatArray, likely: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """(N, NEIGHBOURS) rows of the nearest others, likely ones first: where most buildings are invented, a
+    match has to get from one real building to the next."""
+    count = min(NEIGHBOURS, len(points_m) - 1)
+    found = [np.empty((len(points_m), 0), dtype=np.int64)]
+    for rows in (np.flatnonzero(likely), np.flatnonzero(~likely)):
+        if len(rows) and sum(near.shape[1] for near in found) <= count:
+            _, near = cKDTree(points_m[rows]).query(points_m, k=np.arange(1, min(count + 1, len(rows)) + 1))
+            found.append(rows[near])
+    near = np.concatenate(found, axis=1)
+    own = near == np.arange(len(points_m))[:, None]
+    others = np.take_along_axis(near, np.argsort(own, axis=1, kind="stable"), axis=1)
+    return np.ascontiguousarray(others[:, :count].astype(np.int64))
 
 
 def witnesses(query: QueryMap, triangles: NDArray[np.int64], config: MatcherConfig) -> NDArray[np.int64]:
@@ -136,6 +173,12 @@ def _density(density, frame, x, y):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, inline="always")
+def _is_at(point, place):  # type: ignore[no-untyped-def]
+    """Whether a reference building is the one at a place that was read from the reference."""
+    return abs(point[0] - place[0]) <= TOUCHING_M and abs(point[1] - place[1]) <= TOUCHING_M
+
+
+@njit(nogil=True, cache=True, inline="always")
 def _gain(squared, variance, gate, density, share):  # type: ignore[no-untyped-def]
     """Log-likelihood ratio of one building: its nearest reference building at this squared distance, or
     (negative) none within the gate."""
@@ -143,6 +186,15 @@ def _gain(squared, variance, gate, density, share):  # type: ignore[no-untyped-d
         return math.log(1.0 - share * (1.0 - math.exp(-0.5 * gate * gate / variance)))
     likely = share * math.exp(-0.5 * squared / variance) / (2.0 * math.pi * variance)
     return math.log(likely / density * math.exp(math.pi * density * squared) + (1.0 - share))
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _alike(ours, theirs, usual, sigma, share):  # type: ignore[no-untyped-def]
+    """Log-likelihood ratio of the logarithm of a building's area, where one of the reference is matched whose
+    size is so usual there."""
+    off = (theirs - ours) / sigma
+    likely = share * math.exp(-0.5 * off * off) / (sigma * math.sqrt(2.0 * math.pi))
+    return math.log(likely / usual + 1.0 - share)
 
 
 @njit(nogil=True, cache=True, inline="always")
@@ -154,7 +206,24 @@ def _either(sure, doubtful):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, cache=True)
 def _seed_evidence(  # type: ignore[no-untyped-def]
-    query, shares, stars, corners, others, places, points, starts, frame, density, sigma, hopeless, out
+    query,
+    shares,
+    sizes,
+    stars,
+    corners,
+    others,
+    places,
+    points,
+    starts,
+    frame,
+    density,
+    theirs,
+    usual,
+    sigma,
+    log_area,
+    area_share,
+    hopeless,
+    out,
 ):
     """Evidence of hypotheses: query triangle or pair ``corners[stars[h]]`` lies on ``places[h]`` (K, 2).
 
@@ -191,10 +260,14 @@ def _seed_evidence(  # type: ignore[no-untyped-def]
             for k in range(holds):
                 if held[k] == place:
                     place = NO_MATCH
+            for k in range(corners.shape[1]):
+                if place >= 0 and _is_at(points[place], places[h, k]):
+                    place = NO_MATCH
             if place < 0:
                 total += _gain(-1.0, variance, gate, here, shares[j])
             else:
                 total += _gain(squared, variance, gate, here, shares[j])
+                total += _alike(sizes[j], theirs[place], usual[place], log_area, area_share)
                 held[holds] = place
                 holds += 1
                 u, v = points[place, 0] - wx, points[place, 1] - wy
@@ -204,6 +277,18 @@ def _seed_evidence(  # type: ignore[no-untyped-def]
             if total < hopeless:
                 break
         out[h] = total
+
+
+def surroundings(reference: Ground) -> tuple[FloatArray, ...]:
+    """What the compiled loops look up: the grid's points, its starts and frame, densities, sizes, and how
+    usual those are."""
+    grid = reference.grid
+    return grid.points_m, grid.starts, grid.frame, reference.density_per_m2, reference.sizes, reference.usual
+
+
+def errors(config: MatcherConfig) -> tuple[float, float, float]:
+    """Of a place, m; of the logarithm of an area; and the share of areas that are right up to that."""
+    return config.sigma_m, math.hypot(config.sigma_log_area, AREA_BIAS_SPREAD), config.area_share
 
 
 def seed_evidence(
@@ -225,9 +310,8 @@ def seed_evidence(
         if len(part):
             rows = slice(part[0], part[-1] + 1)
             _seed_evidence(
-                query.points_m, query.shares, stars[rows], triangles, others, places_m[rows],
-                reference.grid.points_m, reference.grid.starts, reference.grid.frame,
-                reference.density_per_m2, config.sigma_m, hopeless, out[rows],
+                query.points_m, query.shares, query.sizes, stars[rows], triangles, others, places_m[rows],
+                *surroundings(reference), *errors(config), hopeless, out[rows],
             )  # fmt: skip
 
     with ThreadPoolExecutor(THREADS) as pool:
@@ -302,5 +386,5 @@ def scale_evidence(scale: float, config: MatcherConfig) -> float:
     return -0.5 * ((scale - 1.0) / config.sigma_scale) ** 2
 
 
-def _normal(values: FloatArray, sigma: float) -> FloatArray:
+def _normal(values: FloatArray, sigma: float | FloatArray) -> FloatArray:
     return np.asarray(np.exp(-0.5 * (values / sigma) ** 2) / (sigma * math.sqrt(2.0 * math.pi)))

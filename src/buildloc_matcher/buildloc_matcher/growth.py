@@ -21,11 +21,15 @@ from buildloc_matcher.evidence import (
     GATE_SIGMAS,
     MAX_GATE_M,
     NO_MATCH,
+    TOUCHING_M,
     Ground,
     QueryMap,
+    _alike,
     _density,
     _either,
     _gain,
+    errors,
+    surroundings,
 )
 from buildloc_matcher.matching import THREADS
 from buildloc_matcher.point_grid import nearest
@@ -35,18 +39,19 @@ HELPFUL_M = 40.0  # neighbours further away than this predict worse
 STIFFNESS_M2 = 3.0 * 60.0**2  # how much a building's turn and scale hold to those of its neighbours
 PASSES = 2
 GIVE_UP = -12.0
-TOUCHING_M = 0.01
 BLOCK = 64  # buildings whose largest support is kept, so that a map of many is not searched at every step
 
 
 @dataclass(frozen=True)
 class Grown:
     """``matches`` (N,) rows of the reference's buildings, NO_MATCH where there is none; ``predicted`` (N, 2)
-    where the match puts every building of the map (NaN where it never got); ``evidence`` in nats."""
+    where the match puts every building of the map (NaN where it never got); ``evidence`` of the places, and
+    ``alike`` of the areas, in nats."""
 
     matches: NDArray[np.int64]
     predicted_m: FloatArray
     evidence: float
+    alike: float
 
 
 @njit(nogil=True, cache=True)
@@ -130,15 +135,35 @@ def _settle(j, place, state, taken):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, cache=True)
 def _grow(  # type: ignore[no-untyped-def]
-    query, shares, near, corners, places, a, b, points, starts, frame, density, sigma, taken, state, predicted
+    query,
+    shares,
+    sizes,
+    near,
+    corners,
+    places,
+    a,
+    b,
+    points,
+    starts,
+    frame,
+    density,
+    theirs,
+    usual,
+    sigma,
+    log_area,
+    area_share,
+    taken,
+    state,
+    predicted,
 ):
-    """Fill ``state`` (N,) and ``predicted`` (N, 2) from corners that lie on ``places``; the evidence.
+    """Fill ``state`` (N,) and ``predicted`` (N, 2) from corners that lie on ``places``; the evidence of the
+    places and of the areas.
 
     ``taken`` counts the buildings of the map on every place; zero before and after.
     """
     total = _grown_evidence(
-        query, shares, near, corners, places, a, b, points, starts, frame, density, sigma, taken, state,
-        predicted,
+        query, shares, sizes, near, corners, places, a, b, points, starts, frame, density, theirs, usual, sigma,
+        log_area, area_share, taken, state, predicted,
     )  # fmt: skip
     for place in state:
         if place >= 0:
@@ -148,7 +173,26 @@ def _grow(  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, cache=True)
 def _grown_evidence(  # type: ignore[no-untyped-def]
-    query, shares, near, corners, places, a, b, points, starts, frame, density, sigma, taken, state, predicted
+    query,
+    shares,
+    sizes,
+    near,
+    corners,
+    places,
+    a,
+    b,
+    points,
+    starts,
+    frame,
+    density,
+    theirs,
+    usual,
+    sigma,
+    log_area,
+    area_share,
+    taken,
+    state,
+    predicted,
 ):
     count = len(query)
     turn = np.empty((count, 2))
@@ -164,7 +208,7 @@ def _grown_evidence(  # type: ignore[no-untyped-def]
     for k in range(3):
         _turn(corners[k], query, near, state, points, turn, a, b)
         _support(corners[k], near, state, support, most)
-    sure, doubtful = 0.0, 0.0
+    sure, doubtful, alike = 0.0, 0.0, 0.0
     while True:
         # Next comes the building with the most matched neighbours: the surest prediction.
         j = _most_supported(support, most)
@@ -182,13 +226,14 @@ def _grown_evidence(  # type: ignore[no-untyped-def]
         sure += _gain(squared if matched else -1.0, variance, gate, here, shares[j])
         doubtful += _gain(squared if matched else -1.0, variance, gate, here, DOUBT * shares[j])
         if matched:
+            alike += _alike(sizes[j], theirs[place], usual[place], log_area, area_share)
             _turn(j, query, near, state, points, turn, a, b)
             _support(j, near, state, support, most)
-        if max(sure, doubtful) < GIVE_UP:
-            return max(sure, doubtful)
+        if max(sure, doubtful) + alike < GIVE_UP:
+            return max(sure, doubtful), alike
     # Once more with all neighbours known: early guesses are put right, and the evidence is the final one.
     for _ in range(PASSES):
-        sure, doubtful = 0.0, 0.0
+        sure, doubtful, alike = 0.0, 0.0, 0.0
         for j in range(count):
             x, y, a, b, variance, weight = _predict(j, query, near, state, points, turn, sigma)
             if weight == 0.0:
@@ -204,13 +249,29 @@ def _grown_evidence(  # type: ignore[no-untyped-def]
             sure += _gain(squared if matched else -1.0, variance, gate, here, shares[j])
             doubtful += _gain(squared if matched else -1.0, variance, gate, here, DOUBT * shares[j])
             if matched:
+                alike += _alike(sizes[j], theirs[place], usual[place], log_area, area_share)
                 _turn(j, query, near, state, points, turn, a, b)
-    return _either(sure, doubtful)
+    return _either(sure, doubtful), alike
 
 
 @njit(nogil=True, cache=True)
 def _grown_nats(  # type: ignore[no-untyped-def]
-    query, shares, near, corners, places, points, starts, frame, density, sigma, out
+    query,
+    shares,
+    sizes,
+    near,
+    corners,
+    places,
+    points,
+    starts,
+    frame,
+    density,
+    theirs,
+    usual,
+    sigma,
+    log_area,
+    area_share,
+    out,
 ):
     taken = np.zeros(len(points), np.int32)
     state, predicted, seats = np.empty(len(query), np.int64), np.empty((len(query), 2)), np.empty(3, np.int64)
@@ -222,10 +283,11 @@ def _grown_nats(  # type: ignore[no-untyped-def]
             x, y = query[j, 0] - query[i, 0], query[j, 1] - query[i, 1]
             u, v = places[h, m, 0] - places[h, k, 0], places[h, m, 1] - places[h, k, 1]
             a, b, squares = a + x * u + y * v, b + x * v - y * u, squares + x * x + y * y
-        out[h] = _grow(
-            query, shares, near, corners[h], seats, a / squares, b / squares, points, starts, frame, density,
-            sigma, taken, state, predicted,
+        nats, alike = _grow(
+            query, shares, sizes, near, corners[h], seats, a / squares, b / squares, points, starts, frame,
+            density, theirs, usual, sigma, log_area, area_share, taken, state, predicted,
         )  # fmt: skip
+        out[h] = nats + alike
 
 
 def grown_nats(
@@ -235,14 +297,14 @@ def grown_nats(
     reference: Ground,
     config: MatcherConfig,
 ) -> FloatArray:
-    """(C,) nats of the match that grows from each seed, corners (C, 3) on places (C, 3, 2)."""
+    """(C,) nats, of places and areas, of the match that grows from each seed, corners (C, 3) on places
+    (C, 3, 2)."""
     out = np.empty(len(corners))
-    where = (reference.grid.points_m, reference.grid.starts, reference.grid.frame)
 
     def work(part: NDArray[np.int64]) -> None:
         _grown_nats(
-            query.points_m, query.shares, query.neighbours, corners[part], places_m[part], *where,
-            reference.density_per_m2, config.sigma_m, nats := np.empty(len(part)),
+            query.points_m, query.shares, query.sizes, query.neighbours, corners[part], places_m[part],
+            *surroundings(reference), *errors(config), nats := np.empty(len(part)),
         )  # fmt: skip
         out[part] = nats
 
@@ -268,7 +330,8 @@ def grow(
     edges, moved = np.roll(source, -1, 1) - source, np.roll(target, -1, 1) - target
     turns = (np.conj(edges) * moved).sum(axis=1) / np.maximum((np.abs(edges) ** 2).sum(axis=1), 1e-9)
     where = (reference.grid.points_m, reference.grid.starts, reference.grid.frame)
-    settings = (reference.density_per_m2, config.sigma_m)
+    settings = (*surroundings(reference), *errors(config))
+    about = (query.points_m, query.shares, query.sizes, query.neighbours)
     states = np.empty((len(corners), len(query.points_m)), dtype=np.int64)
     taken = np.zeros(len(reference.buildings_m), dtype=np.int32)
     grown: list[tuple[int, Grown]] = []
@@ -278,10 +341,8 @@ def grow(
             continue
         state, predicted = states[len(grown)], np.empty((len(query.points_m), 2))
         start = (triangle, seats, turns[c].real, turns[c].imag)
-        nats = _grow(
-            query.points_m, query.shares, query.neighbours, *start, *where, *settings, taken, state, predicted
-        )
+        nats, alike = _grow(*about, *start, *settings, taken, state, predicted)
         if nats > 0.0:
             matched = np.where(state >= 0, reference.grid.order[np.maximum(state, 0)], NO_MATCH)
-            grown.append((c, Grown(matched, predicted, nats)))
+            grown.append((c, Grown(matched, predicted, nats, alike)))
     return grown

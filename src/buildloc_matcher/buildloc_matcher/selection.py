@@ -165,10 +165,12 @@ def _list(
 ) -> None:
     """Add the best of the matches (by the number of their seed) that are unlike those in the list, scored,
     best first; ``clusters`` are those of the seeds."""
-    ranked = sorted(grown, key=lambda found: -found[1].evidence)
+    ranked = sorted(
+        ((match.evidence + match.alike, seed, match) for seed, match in grown), key=lambda one: -one[0]
+    )
     added = 0
-    for seed, match in ranked:
-        if added == GROWN_SCORED or match.evidence < ranked[0][1].evidence - NEGLIGIBLE_NATS:
+    for nats, seed, match in ranked:
+        if added == GROWN_SCORED or nats < ranked[0][0] - NEGLIGIBLE_NATS:
             break
         if any(_same(match.matches, other.matches) for other in listed):
             continue
