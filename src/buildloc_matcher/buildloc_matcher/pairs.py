@@ -21,8 +21,8 @@ from buildloc_matcher.point_grid import _reach, nearest
 LENGTHS_M = (15.0, 120.0)
 LENGTH_OFF_M, LENGTH_OFF = 3.0, 0.03  # how much longer or shorter it may be in the reference: m, and share
 LOG_AREA_OFF = 0.6
-HOPELESS = -6.0  # a pair that has sunk below this is given up: there are many
-USED_OFTEN = 2  # pairs of one building, so that not all of them fail with it
+HOPELESS = -12.0  # a pair that has sunk below this is given up
+USED_OFTEN = 3  # pairs of one building, so that not all of them fail with it
 
 
 def choose_pairs(query: QueryMap, reference: Ground) -> NDArray[np.int64]:
