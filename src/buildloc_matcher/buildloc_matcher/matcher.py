@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from buildloc_matcher.acceptance import Outcome, Verdict, judge_candidate, lead, log_odds, score
 from buildloc_matcher.acquisition import NotAcquired, acquire
 from buildloc_matcher.config import MatcherConfig, check_matcher
-from buildloc_matcher.evidence import QueryMap, query_map, seed_evidence
+from buildloc_matcher.evidence import LEAST_AREA_M2, QueryMap, query_map, seed_evidence
 from buildloc_matcher.follow import Followed, follow
 from buildloc_matcher.geometry import Similarity, wrap
 from buildloc_matcher.growth import grown_nats
@@ -37,7 +37,6 @@ WARM_UP_BUILDINGS = 40
 MOST_GROWN = 400_000  # buildings of the matches that grow from hypotheses in a look
 SPARSE = 100  # buildings; a map of more has stars enough
 BEYOND_DOUBT = 600.0
-LEAST_AREA_M2 = 1e-3  # of a building that has a size at all
 MOST_STARS = 4096  # of one look; those of a map of 100,000 buildings, matched, would fill 30 GB
 
 

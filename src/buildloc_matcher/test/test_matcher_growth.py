@@ -153,6 +153,6 @@ def test_evidence_of_many_seeds_is_that_of_each_match() -> None:
     places = SEEN.centroids_m[[[40, 41, 42], [0, 1, 2], [7, 30, 55]]]
     nats = grown_nats(query, corners, places, GROUND, DEFAULT)
     alone = [grow(query, corners[k : k + 1], places[k : k + 1], GROUND, DEFAULT) for k in range(3)]
-    expected = [match[0][1].evidence if match else 0.0 for match in alone]
+    expected = [match[0][1].evidence + match[0][1].alike if match else 0.0 for match in alone]
     assert np.maximum(nats, 0.0) == pytest.approx(expected)
     assert expected[0] > 50.0
