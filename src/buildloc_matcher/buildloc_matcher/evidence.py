@@ -22,7 +22,7 @@ from scipy.special import ndtr
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.geometry import area_around_m2
 from buildloc_matcher.matching import THREADS
-from buildloc_matcher.point_grid import PointGrid, grid_points, nearest
+from buildloc_matcher.point_grid import Frame, PointGrid, grid_points, nearest
 
 DENSITY_CELL_M = 100.0
 DENSITY_CELLS = 3
@@ -279,16 +279,20 @@ def _seed_evidence(  # type: ignore[no-untyped-def]
         out[h] = total
 
 
-def surroundings(reference: Ground) -> tuple[FloatArray, ...]:
-    """What the compiled loops look up: the grid's points, its starts and frame, densities, sizes, and how
-    usual those are."""
+Surroundings = tuple[
+    FloatArray, NDArray[np.int64], Frame, FloatArray, FloatArray, FloatArray, float, float, float,
+]  # fmt: skip
+
+
+def surroundings(reference: Ground, config: MatcherConfig) -> Surroundings:
+    """What the compiled loops go by: the grid's points, starts and frame, densities, sizes and how usual
+    these are; the errors of a place, m, and of the logarithm of an area, and the share of areas that are
+    right up to that."""
     grid = reference.grid
-    return grid.points_m, grid.starts, grid.frame, reference.density_per_m2, reference.sizes, reference.usual
-
-
-def errors(config: MatcherConfig) -> tuple[float, float, float]:
-    """Of a place, m; of the logarithm of an area; and the share of areas that are right up to that."""
-    return config.sigma_m, math.hypot(config.sigma_log_area, AREA_BIAS_SPREAD), config.area_share
+    return (
+        grid.points_m, grid.starts, grid.frame, reference.density_per_m2, reference.sizes, reference.usual,
+        config.sigma_m, math.hypot(config.sigma_log_area, AREA_BIAS_SPREAD), config.area_share,
+    )  # fmt: skip
 
 
 def seed_evidence(
@@ -311,7 +315,7 @@ def seed_evidence(
             rows = slice(part[0], part[-1] + 1)
             _seed_evidence(
                 query.points_m, query.shares, query.sizes, stars[rows], triangles, others, places_m[rows],
-                *surroundings(reference), *errors(config), hopeless, out[rows],
+                *surroundings(reference, config), hopeless, out[rows],
             )  # fmt: skip
 
     with ThreadPoolExecutor(THREADS) as pool:

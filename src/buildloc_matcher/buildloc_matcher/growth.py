@@ -28,7 +28,6 @@ from buildloc_matcher.evidence import (
     _density,
     _either,
     _gain,
-    errors,
     surroundings,
 )
 from buildloc_matcher.matching import THREADS
@@ -162,8 +161,8 @@ def _grow(  # type: ignore[no-untyped-def]
     ``taken`` counts the buildings of the map on every place; zero before and after.
     """
     total = _grown_evidence(
-        query, shares, sizes, near, corners, places, a, b, points, starts, frame, density, theirs, usual, sigma,
-        log_area, area_share, taken, state, predicted,
+        query, shares, sizes, near, corners, places, a, b, points, starts, frame, density, theirs, usual,
+        sigma, log_area, area_share, taken, state, predicted,
     )  # fmt: skip
     for place in state:
         if place >= 0:
@@ -304,7 +303,7 @@ def grown_nats(
     def work(part: NDArray[np.int64]) -> None:
         _grown_nats(
             query.points_m, query.shares, query.sizes, query.neighbours, corners[part], places_m[part],
-            *surroundings(reference), *errors(config), nats := np.empty(len(part)),
+            *surroundings(reference, config), nats := np.empty(len(part)),
         )  # fmt: skip
         out[part] = nats
 
@@ -330,7 +329,7 @@ def grow(
     edges, moved = np.roll(source, -1, 1) - source, np.roll(target, -1, 1) - target
     turns = (np.conj(edges) * moved).sum(axis=1) / np.maximum((np.abs(edges) ** 2).sum(axis=1), 1e-9)
     where = (reference.grid.points_m, reference.grid.starts, reference.grid.frame)
-    settings = (*surroundings(reference), *errors(config))
+    settings = surroundings(reference, config)
     about = (query.points_m, query.shares, query.sizes, query.neighbours)
     states = np.empty((len(corners), len(query.points_m)), dtype=np.int64)
     taken = np.zeros(len(reference.buildings_m), dtype=np.int32)

@@ -15,6 +15,7 @@ from buildloc_matcher.evidence import (
     absence_evidence,
     area_evidence,
     density_at,
+    ground,
     placed_evidence,
     query_map,
     scale_evidence,
@@ -188,6 +189,65 @@ def test_invented_buildings_are_no_witnesses_and_cost_little() -> None:
     with_them = placed_evidence(points, query.shares, GROUND, DEFAULT)
     without = placed_evidence(houses, query.shares[: len(houses)], GROUND, DEFAULT)
     assert without - 6.0 < with_them
+
+
+def test_a_match_gets_from_one_real_building_to_the_next() -> None:
+    """Neighbours are the likely ones first, however many invented ones lie between them."""
+    rng = np.random.default_rng(3)
+    houses = np.column_stack([60.0 * np.arange(20.0), rng.uniform(-5.0, 5.0, 20)])
+    between = rng.uniform((0.0, -20.0), (1140.0, 20.0), (25, 2))
+    areas = np.concatenate([np.full(20, 400.0), np.maximum(rng.lognormal(math.log(33.0), 0.5, 25), 20.0)])
+    for first in (0, 15):  # twenty houses, more than a building has neighbours, and five
+        points = np.concatenate([houses[first:], between])
+        query = query_map(points, areas[first:], DEFAULT)
+        likely = query.shares >= 0.5 * DEFAULT.match_share
+        assert likely[: 20 - first].all() and 0.3 * len(points) > np.count_nonzero(likely[20 - first :])
+        for k, found in enumerate(query.neighbours.tolist()):
+            others = np.delete(np.arange(len(points)), k)
+            away = np.hypot(*(points[others] - points[k]).T)
+            assert found == others[np.lexsort((away, ~likely[others]))][:NEIGHBOURS].tolist()
+
+
+def test_the_least_area_of_a_map_does_not_make_small_buildings_suspect() -> None:
+    rng = np.random.default_rng(8)
+    points = rng.uniform(0.0, 900.0, (1500, 2))
+    real = np.exp(rng.uniform(math.log(20.0), math.log(400.0), 1500))
+    shares = shares_of(points, real, DEFAULT)
+    least, above = shares[real < 22.0].mean(), shares[(real > 26.0) & (real < 32.0)].mean()
+    assert least > 0.8 * above > 0.3
+    invented = rng.lognormal(math.log(33.0), 0.5, 400)
+    suspect = shares_of(points[:100], invented[invented > 20.0][:100], DEFAULT)
+    assert suspect.max() < 0.25
+
+
+def test_a_corner_of_the_seed_is_no_witness() -> None:
+    corners = np.array([[0.0, 0.0], [40.0, 0.0], [0.0, 30.0]])
+    query, nothing = np.concatenate([corners, [[3.0, 2.0]]]), np.array([[3000.0, 3000.0]])
+    seeds, zero = corners[None], np.zeros(1, dtype=np.int64)
+
+    def nats(others: FloatArray) -> float:
+        reference = alike(np.concatenate([corners, others]))
+        return float(seed_evidence(mapped(query), np.array([[0, 1, 2]]), zero, seeds, reference, DEFAULT)[0])
+
+    # The fourth lies beside the first, whose place in the reference is the corner's.
+    assert nats(nothing) < 0.0 < nats(np.concatenate([nothing, [[3.2, 2.1]]]))
+
+
+def test_a_witness_of_another_size_says_less() -> None:
+    corners = TRIANGLES[len(TRIANGLES) // 2]
+    rng = np.random.default_rng(2)
+    areas = rng.lognormal(math.log(200.0), 0.5, len(CITY))
+    reference = ground(CITY.centroids_m, areas)
+    rows = np.array([int(np.argmin(np.hypot(*(CITY.centroids_m - p).T))) for p in SEEN.centroids_m])
+
+    def nats(seen_m2: FloatArray) -> float:
+        query = query_map(as_map(SEEN.centroids_m), seen_m2, DEFAULT)
+        seeds, zero = SEEN.centroids_m[corners][None], np.zeros(1, dtype=np.int64)
+        return float(seed_evidence(query, corners[None], zero, seeds, reference, DEFAULT)[0])
+
+    right, exchanged = nats(areas[rows]), nats(rng.permutation(areas[rows]))
+    assert right > exchanged + 5.0
+    assert nats(1.2 * areas[rows]) > exchanged + 4.0  # roofs are larger than walls, all of them
 
 
 def test_one_building_of_the_reference_is_no_witness_twice() -> None:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from buildloc_matcher.acceptance import refuse_refined
 from buildloc_matcher.config import matcher_config
 from buildloc_matcher.match_start import start_of
 from buildloc_matcher.matcher import Matcher, MatchResult
@@ -109,7 +110,7 @@ def locate(matcher: Matcher, maps: Maps, keyframes: int, final: bool) -> Predict
     ranked = replace(ranked, refused=answer.reason if isinstance(answer, NoFix) else None)
     if not final:
         return ranked
-    refined = _refined(matcher, found, snapshot, seen) if isinstance(answer, NoFix) else _place_m(answer)
+    refined = _unaccepted(matcher, found, snapshot, seen) if isinstance(answer, NoFix) else _place_m(answer)
     seconds = {**ranked.seconds, "refine": time.perf_counter() - started}
     return replace(ranked, final_m=refined, seconds=seconds)
 
@@ -124,14 +125,18 @@ def ranking(matcher: Matcher, found: MatchResult) -> Prediction:
     return Prediction(kept[:, :2], kept[:, 2:], centre, bins, None, refused, seconds, found.funnel)
 
 
-def _refined(
+def _unaccepted(
     matcher: Matcher, found: MatchResult, snapshot: Snapshot, seen: Sequence[FrameObservation]
-) -> FloatArray | None:
+) -> FloatArray:
+    """Where the last camera would be if the best candidate were accepted: refined, or where the match has it
+    when the refinement finds too few buildings or no single optimum."""
     assert found.query is not None
     ground, config = matcher.database.ground, matcher.config
     begun = start_of(found.scores[0], found.query, snapshot.keyframes, ground, config)
     refined = refine(begun, seen, ground, config)
-    return refined.position_m if isinstance(refined, Refined) else None
+    if isinstance(refined, Refined) and refuse_refined(refined, config) is None:
+        return refined.position_m
+    return begun.state.poses[-1, :2]
 
 
 def _place_m(fix: Fix) -> FloatArray:
