@@ -149,25 +149,45 @@ def test_tiles_of_a_grid_lie_about_their_places(outlines: np.ndarray) -> None:
             assert_allclose(tile[0], raster(outlines, *corner.tolist(), (SIDE_PX, SIDE_PX)), atol=0.26)
 
 
+def built_or_not(tiles: np.ndarray) -> np.ndarray:
+    """A descriptor that tells whether a tile shows anything."""
+    built = tiles.any(axis=(1, 2, 3))
+    return np.column_stack([built, ~built]).astype(np.float32)
+
+
+HOUSE = np.array([shapely.box(*(CENTRE - 10.0), *(CENTRE + 10.0))])
+BUILT = np.array([[1.0, 0.0], [0.0, 1.0]], dtype=np.float32)
+
+
 def test_distances_are_those_of_the_descriptors_and_far_outside_the_circle() -> None:
-    house, grid = np.array([shapely.box(*(CENTRE - 10.0), *(CENTRE + 10.0))]), Grid.about(CENTRE, 120.0)
-    rows = list[int]()
-    queries = np.array([[1.0, 0.0], [0.0, 1.0]], dtype=np.float32)
-
-    def encode(tiles: np.ndarray) -> np.ndarray:
-        built = tiles.any(axis=(1, 2, 3))
-        return np.column_stack([built, ~built]).astype(np.float32)
-
-    apart, seconds = distances(house, grid, encode, queries, lambda: rows.append(1))
-    assert len(rows) == grid.count and seconds > 0.0
+    grid, rows = Grid.about(CENTRE, 120.0), list[int]()
+    (apart,), (seconds,) = distances(HOUSE, [grid], built_or_not, [BUILT], lambda: rows.append(1))
+    assert len(rows) == len(grid.inside) and seconds > 0.0
     assert (apart[:, ~grid.inside] == FARTHEST).all()
     assert apart[0, 2, 2] == 0.0 and apart[1, 2, 2] == 2.0
     assert apart[0, 0, 2] == 2.0 and apart[1, 0, 2] == 0.0  # 100 m off: the house is out of the tile
 
 
+def test_circles_that_overlap_describe_their_tiles_once() -> None:
+    grids = [Grid.about(CENTRE + np.array(by), 120.0) for by in ([0.0, 0.0], [70.0, -130.0], [9000.0, 60.0])]
+    asked = list[int]()
+
+    def counted(tiles: np.ndarray) -> np.ndarray:
+        asked.append(len(tiles))
+        return built_or_not(tiles)
+
+    one = np.array([[0.6, 0.8]], dtype=np.float32)
+    together, _ = distances(HOUSE, grids, counted, [BUILT, one, BUILT], lambda: None)
+    for found, grid, query in zip(together, grids, (BUILT, one, BUILT), strict=True):
+        (alone,), _ = distances(HOUSE, [grid], built_or_not, [query], lambda: None)
+        assert_allclose(found, alone)
+    built = (together[0][0] == 0.0).sum()  # those of the first circle are those of the second as well
+    assert 9 <= built <= sum(asked) - 1 < built + (together[1][0] < 1.0).sum()
+
+
 def test_hypotheses_are_carried_by_odometry() -> None:
     grid = Grid.about(CENTRE, 300.0)
-    apart = np.full((3, grid.count, grid.count), 2.0, dtype=np.float16)
+    apart = np.full((3, *grid.inside.shape), 2.0, dtype=np.float16)
     path = np.array([[7.0, 3.0], [57.0, 3.0], [57.0, -47.0]])  # a tile to the east, then one to the south
     for plane, (row, column) in zip(apart, [(6, 5), (6, 6), (5, 6)], strict=True):
         plane[row, column] = 0.0

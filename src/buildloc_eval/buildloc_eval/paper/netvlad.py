@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -56,22 +56,47 @@ class Encoders:
 
 @dataclass(frozen=True)
 class Grid:
-    """Tiles about a circle, rows north and columns east; the centre of the first, and which are inside."""
+    """Tiles at whole multiples of STEP_M: the centre of the first, and which of them (rows north, columns
+    east) are searched."""
 
     west_m: float
     south_m: float
-    count: int
     inside: NDArray[np.bool_]
 
     @classmethod
     def about(cls, centre_m: FloatArray, radius_m: float) -> Grid:
-        """Tiles within a circle. They lie at whole multiples of STEP_M: were they laid about the circle, a
-        flight about its centre would lie on them better than by chance."""
+        """Tiles within a circle. Were they laid about the circle, a flight about its centre would lie on
+        them better than by chance."""
         west, south = np.ceil((centre_m - radius_m) / STEP_M) * STEP_M
         steps = STEP_M * np.arange(math.floor(2.0 * radius_m / STEP_M) + 1)
         east_m, north_m = west + steps - centre_m[0], south + steps - centre_m[1]
-        inside = np.hypot(east_m[None, :], north_m[:, None]) <= radius_m
-        return cls(float(west), float(south), len(steps), inside)
+        return cls(float(west), float(south), np.hypot(east_m[None, :], north_m[:, None]) <= radius_m)
+
+    @classmethod
+    def over(cls, grids: Sequence[Grid]) -> Grid:
+        """The tiles of any of some grids, at least one."""
+        west, south = min(grid.west_m for grid in grids), min(grid.south_m for grid in grids)
+        corners = [grid._first_in(west, south) for grid in grids]
+        rows = max(row + grid.inside.shape[0] for grid, (row, _) in zip(grids, corners, strict=True))
+        columns = max(column + grid.inside.shape[1] for grid, (_, column) in zip(grids, corners, strict=True))
+        inside = np.zeros((rows, columns), dtype=np.bool_)
+        for grid, (row, column) in zip(grids, corners, strict=True):
+            inside[row : row + grid.inside.shape[0], column : column + grid.inside.shape[1]] |= grid.inside
+        return cls(west, south, inside)
+
+    def columns_of(self, whole: Grid, row: int, columns: NDArray[np.intp]) -> tuple[int, NDArray[np.intp]]:
+        """The row and the columns (C,) that tiles of another grid have in this one; -1 for those outside."""
+        first_row, first_column = self._first_in(whole.west_m, whole.south_m)
+        row, columns = row - first_row, columns - first_column
+        if not 0 <= row < self.inside.shape[0]:
+            return row, np.full_like(columns, -1)
+        known = (columns >= 0) & (columns < self.inside.shape[1])
+        known[known] = self.inside[row, columns[known]]
+        return row, np.where(known, columns, -1)
+
+    def _first_in(self, west_m: float, south_m: float) -> tuple[int, int]:
+        """Row and column of the first tile in a grid that begins there."""
+        return round((self.south_m - south_m) / STEP_M), round((self.west_m - west_m) / STEP_M)
 
 
 def load_encoders(folder: Path) -> Encoders:
@@ -152,8 +177,9 @@ def raster(outlines: Outlines, west_m: float, south_m: float, size_px: tuple[int
 def tile_rows(outlines: Outlines, grid: Grid) -> Iterator[tuple[int, NDArray[np.intp], Tiles]]:
     """Row, columns (C,) and tiles (C, 1, SIDE_PX, SIDE_PX) of every row of the grid."""
     tree, half, stride = shapely.STRtree(outlines), SIDE_PX * PIXEL_M / 2.0, round(STEP_M / PIXEL_M)
-    west, wide = grid.west_m - half, (grid.count - 1) * stride + SIDE_PX
-    for row in range(grid.count):
+    count, across = grid.inside.shape
+    west, wide = grid.west_m - half, (across - 1) * stride + SIDE_PX
+    for row in range(count):
         south = grid.south_m + row * STEP_M - half
         strip = shapely.box(west, south, west + wide * PIXEL_M, south + 2.0 * half)
         drawn = raster(outlines[np.sort(tree.query(strip))], west, south, (wide, SIDE_PX))
@@ -163,20 +189,32 @@ def tile_rows(outlines: Outlines, grid: Grid) -> Iterator[tuple[int, NDArray[np.
 
 
 def distances(
-    outlines: Outlines, grid: Grid, encode: Encode, queries: Descriptors, step: Callable[[], None]
-) -> tuple[NDArray[np.float16], float]:
-    """(Q, rows, columns) squared distances of descriptors (Q, D) to every tile of a grid, FARTHEST outside
-    the circle; and the seconds that comparing took, without describing the tiles. ``step`` follows a row."""
-    found = np.full((len(queries), grid.count, grid.count), FARTHEST, dtype=np.float16)
-    empty, seconds = encode(np.zeros((1, 1, SIDE_PX, SIDE_PX), dtype=np.float32)), 0.0
-    for row, columns, tiles in tile_rows(outlines, grid):
+    outlines: Outlines,
+    grids: Sequence[Grid],
+    encode: Encode,
+    queries: Sequence[Descriptors],
+    step: Callable[[], None],
+) -> tuple[list[NDArray[np.float16]], list[float]]:
+    """Of every grid the squared distances (Q, rows, columns) of its descriptors (Q, D) to its tiles, FARTHEST
+    outside the circle; and the seconds that comparing took, without describing the tiles. A tile of several
+    grids is described once. ``step`` follows a row."""
+    found = [
+        np.full((len(some), *grid.inside.shape), FARTHEST, dtype=np.float16)
+        for grid, some in zip(grids, queries, strict=True)
+    ]
+    whole, seconds = Grid.over(grids), [0.0] * len(grids)
+    empty = encode(np.zeros((1, 1, SIDE_PX, SIDE_PX), dtype=np.float32))
+    for row, columns, tiles in tile_rows(outlines, whole):
         built = tiles.any(axis=(1, 2, 3))
         described = np.repeat(empty, len(columns), axis=0)  # water and woods look the same everywhere
         if built.any():
             described[built] = encode(tiles[built])
-        started = time.perf_counter()
-        found[:, row, columns] = 2.0 - 2.0 * (queries @ described.T)
-        seconds += time.perf_counter() - started
+        for number, (grid, some) in enumerate(zip(grids, queries, strict=True)):
+            started = time.perf_counter()
+            at, where = grid.columns_of(whole, row, columns)
+            if (known := where >= 0).any():
+                found[number][:, at, where[known]] = 2.0 - 2.0 * (some @ described[known].T)
+            seconds[number] += time.perf_counter() - started
         step()
     return found, seconds
 

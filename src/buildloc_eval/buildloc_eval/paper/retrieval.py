@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-import shapely
 from buildloc_msgs_py.types import FloatArray, Mask
+from numpy.typing import NDArray
 
 from buildloc_eval.paper.brm import Survivors, used_keyframes
 from buildloc_eval.paper.flights import PaperFlight
@@ -82,56 +82,64 @@ def prediction(
 
 
 def locate(
-    views: Mapping[int, View], outlines: Outlines, grid: Grid, encoders: Encoders, step: Callable[[], None]
-) -> dict[int, tuple[Survivors, dict[str, float]]]:
-    """The hypotheses and the seconds of every seed's view. Tiles are described once for all of them."""
-    described, encoding_s = list[Descriptors](), list[float]()
-    for some in views.values():
-        started = time.perf_counter()
-        described.append(encoders.drone(some.tiles))
-        encoding_s.append(time.perf_counter() - started)
-    queries = np.concatenate(described)
-    apart, comparing_s = distances(outlines, grid, encoders.reference, queries, step)
-    found, first = dict[int, tuple[Survivors, dict[str, float]]](), 0
-    for (s, some), describing in zip(views.items(), encoding_s, strict=True):
+    views: Mapping[int, View],
+    apart: NDArray[np.float16],
+    grid: Grid,
+    describing_s: float,
+    comparing_s: float,
+) -> Iterator[tuple[int, Survivors, dict[str, float]]]:
+    """Every seed of a flight with its hypotheses and its seconds, from the distances (Q, rows, columns) to
+    the tiles of all keyframes, seed after seed, and what it took to describe and to compare them."""
+    first = 0
+    for s, some in views.items():
         started, count = time.perf_counter(), len(some.tiles)
         hypotheses = accumulate(apart[first : first + count], some.path_m, grid)
-        search = comparing_s * count / len(apart) + time.perf_counter() - started
-        found[s] = hypotheses, {"describe": describing, "search": search}
+        share, carrying_s = count / len(apart), time.perf_counter() - started
+        yield (
+            s, hypotheses, {"describe": share * describing_s, "search": share * comparing_s + carrying_s}
+        )  # fmt: skip
         first += count
-    return found
 
 
 def predict_netvlad(
     stores: Stores, flights: Sequence[PaperFlight], plan: Plan, seed: int, reference: Outlines,
     encoders: Encoders, seen_by: SeenBy, say: Say,
 ) -> None:  # fmt: skip
-    """What is not there yet, all seeds of a flight at once."""
-    store, centroids = stores.of(NETVLAD), shapely.get_coordinates(shapely.centroid(reference))
-    for flight in flights:
-        asked = {
-            s: {
-                radius: prediction_name(NETVLAD, radius, flight, s, prefixes=False)
-                for radius in plan.radii_km
-            }
-            for s in range(seed, seed + plan.seeds)
-        }
-        left = [s for s, names in asked.items() if not all(store.has(name) for name in names.values())]
-        if not left:
+    """What is not there yet: all seeds of all flights at once, since their circles share most tiles."""
+    views = {flight: _views(stores, flight, plan, seed, seen_by) for flight in flights}
+    views = {flight: seen for flight, seen in views.items() if seen}
+    if not views:
+        return
+    queries, describing_s = list[Descriptors](), list[float]()
+    for seen in views.values():
+        started = time.perf_counter()
+        queries.append(encoders.drone(np.concatenate([some.tiles for some in seen.values()])))
+        describing_s.append(time.perf_counter() - started)
+    radius_m = 1000.0 * max(plan.radii_km)
+    grids = [Grid.about(np.array(flight.centre_m), radius_m) for flight in views]
+    step = partial(Progress(say, NETVLAD, len(Grid.over(grids).inside)).step, "rows of tiles")
+    apart, comparing_s = distances(reference, grids, encoders.reference, queries, step)
+    for number, (flight, seen) in enumerate(views.items()):
+        told = (apart[number], grids[number], describing_s[number], comparing_s[number])
+        for s, hypotheses, seconds in locate(seen, *told):
+            for radius in plan.radii_km:
+                kept = prediction(hypotheses, seconds, np.array(flight.centre_m), radius)
+                stores.of(NETVLAD).save(prediction_name(NETVLAD, radius, flight, s, prefixes=False), kept)
+
+
+def _views(stores: Stores, flight: PaperFlight, plan: Plan, seed: int, seen_by: SeenBy) -> dict[int, View]:
+    """What the seeds of a flight see that have no prediction yet; a seed whose last keyframe links to nothing
+    gets its predictions here."""
+    store, views = stores.of(NETVLAD), dict[int, View]()
+    for s in range(seed, seed + plan.seeds):
+        names = [prediction_name(NETVLAD, radius, flight, s, prefixes=False) for radius in plan.radii_km]
+        if all(store.has(name) for name in names):
             continue
-        track, views = stores.tracks.load(flight.name), dict[int, View]()
-        for s in left:
-            seen = view(track, stores.maps.load(maps_name(flight, s)), seen_by(flight, s))
-            if seen is not None:
-                views[s] = seen
-                continue
-            for name in asked[s].values():
-                store.save(name, nothing("keyframe links to none of the latest keyframes"))
-        if not views:
+        track, maps = stores.tracks.load(flight.name), stores.maps.load(maps_name(flight, s))
+        seen = view(track, maps, seen_by(flight, s))
+        if seen is not None:
+            views[s] = seen
             continue
-        centre, radius_m = np.array(flight.centre_m), 1000.0 * max(plan.radii_km)
-        near, grid = np.hypot(*(centroids - centre).T) <= radius_m, Grid.about(centre, radius_m)
-        step = partial(Progress(say, NETVLAD, grid.count).step, flight.name)
-        for s, (hypotheses, seconds) in locate(views, reference[near], grid, encoders, step).items():
-            for radius, name in asked[s].items():
-                store.save(name, prediction(hypotheses, seconds, centre, radius))
+        for name in names:
+            store.save(name, nothing("keyframe links to none of the latest keyframes"))
+    return views
