@@ -51,7 +51,7 @@ class MatcherConfig:
     sigma_m: float = param(2.0, "error of a map building against its neighbours, per axis, m", 0.1, 50.0)
     match_share: float = param(0.7, "share of the map's real buildings that the reference has", 0.05, 0.99)
     false_per_km2: float = param(
-        160.0, "buildings that the segmenter invents on a square kilometre, per km2", 0.0, 1e5
+        130.0, "buildings that the segmenter invents on a square kilometre, per km2", 0.0, 1e5
     )
     false_area_m2: float = param(33.0, "median area of such a building, m2", 1.0, 1e4)
     seen_share: float = param(
