@@ -242,7 +242,7 @@ def _seed_evidence(  # type: ignore[no-untyped-def]
             n += 1.0
             qx, qy, rx, ry, qq = qx + x, qy + y, rx + u, ry + v, qq + x * x + y * y
             real, imag = real + x * u + y * v, imag + x * v - y * u
-        total = 0.0
+        sure, doubtful = 0.0, 0.0
         for w in range(others.shape[1]):
             j = others[s, w]
             if j == NO_MATCH:
@@ -263,20 +263,21 @@ def _seed_evidence(  # type: ignore[no-untyped-def]
             for k in range(corners.shape[1]):
                 if place >= 0 and _is_at(points[place], places[h, k]):
                     place = NO_MATCH
-            if place < 0:
-                total += _gain(-1.0, variance, gate, here, shares[j])
-            else:
-                total += _gain(squared, variance, gate, here, shares[j])
-                total += _alike(sizes[j], theirs[place], usual[place], log_area, area_share)
+            apart = squared if place >= 0 else -1.0
+            sure += _gain(apart, variance, gate, here, shares[j])
+            doubtful += _gain(apart, variance, gate, here, DOUBT * shares[j])
+            if place >= 0:
+                alike = _alike(sizes[j], theirs[place], usual[place], log_area, area_share)
+                sure, doubtful = sure + alike, doubtful + alike
                 held[holds] = place
                 holds += 1
                 u, v = points[place, 0] - wx, points[place, 1] - wy
                 n += 1.0
                 qx, qy, rx, ry, qq = qx + x, qy + y, rx + u, ry + v, qq + x * x + y * y
                 real, imag = real + x * u + y * v, imag + x * v - y * u
-            if total < hopeless:
+            if max(sure, doubtful) < hopeless:
                 break
-        out[h] = total
+        out[h] = _either(sure, doubtful)
 
 
 Surroundings = tuple[
