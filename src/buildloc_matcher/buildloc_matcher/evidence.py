@@ -29,6 +29,7 @@ DENSITY_CELLS = 3
 MIN_DENSITY_PER_M2 = 2e-5
 NEIGHBOURS = 12
 WITNESSES = 16
+LOOKED_AT = 64  # nearest buildings among which witnesses and neighbours are chosen
 GATE_SIGMAS = 3.0
 MAX_GATE_M = 16.0
 HOPELESS = -10.0  # a hypothesis that has sunk below this is given up
@@ -95,8 +96,8 @@ def density_at(points_m: FloatArray, reference: Ground) -> FloatArray:
 @dataclass(frozen=True)
 class QueryMap:
     """Buildings of the map (N, 2) metres, their areas (N,) and the logarithms of these, with what probability
-    the reference has each of them (N,), and of each its nearest others (N, NEIGHBOURS): those that are more
-    likely in the reference than invented, then others, nearest first."""
+    the reference has each of them (N,), and of each its NEIGHBOURS (N, K), near ones that the reference likely
+    has first."""
 
     points_m: FloatArray
     areas_m2: FloatArray
@@ -129,40 +130,30 @@ def shares_of(points_m: FloatArray, areas_m2: FloatArray, config: MatcherConfig)
 def query_map(points_m: FloatArray, areas_m2: FloatArray, config: MatcherConfig) -> QueryMap:
     """The map's buildings with their neighbourhoods; N >= 2."""
     shares = shares_of(points_m, areas_m2, config)
-    return QueryMap(
-        np.ascontiguousarray(points_m), areas_m2, np.log(areas_m2), shares,
-        _neighbours(points_m, shares >= 0.5 * config.match_share),
-    )  # fmt: skip
-
-
-def _neighbours(points_m: FloatArray, likely: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """(N, NEIGHBOURS) rows of the nearest others, likely ones first: where most buildings are invented, a
-    match has to get from one real building to the next."""
     count = min(NEIGHBOURS, len(points_m) - 1)
-    found = [np.empty((len(points_m), 0), dtype=np.int64)]
-    for rows in (np.flatnonzero(likely), np.flatnonzero(~likely)):
-        if len(rows) and sum(near.shape[1] for near in found) <= count:
-            _, near = cKDTree(points_m[rows]).query(points_m, k=np.arange(1, min(count + 1, len(rows)) + 1))
-            found.append(rows[near])
-    near = np.concatenate(found, axis=1)
-    own = near == np.arange(len(points_m))[:, None]
-    others = np.take_along_axis(near, np.argsort(own, axis=1, kind="stable"), axis=1)
-    return np.ascontiguousarray(others[:, :count].astype(np.int64))
+    near = _nearest(points_m, points_m, shares, np.arange(len(points_m))[:, None])[:, :count]
+    return QueryMap(np.ascontiguousarray(points_m), areas_m2, np.log(areas_m2), shares, near)
 
 
-def witnesses(query: QueryMap, triangles: NDArray[np.int64], config: MatcherConfig) -> NDArray[np.int64]:
-    """(S, W) buildings of the map, WITNESSES at most, nearest to each triangle or pair (S, K), its corners
-    left out, and those that are more likely invented than not; NO_MATCH pads."""
-    likely = np.flatnonzero(query.shares >= 0.5 * config.match_share)
-    if not len(triangles) or not len(likely):
-        return np.full((len(triangles), WITNESSES), NO_MATCH, dtype=np.int64)
-    count = min(WITNESSES + triangles.shape[1], len(likely))
-    middles = query.points_m[triangles].mean(axis=1)
-    _, rows = cKDTree(query.points_m[likely]).query(middles, k=np.arange(1, count + 1))
-    near = likely[rows]
-    own = (near[:, :, None] == triangles[:, None, :]).any(axis=2)
-    others = np.take_along_axis(np.where(own, NO_MATCH, near), np.argsort(own, axis=1, kind="stable"), axis=1)
-    return np.ascontiguousarray(others[:, :WITNESSES].astype(np.int64))
+def _nearest(
+    places_m: FloatArray, points_m: FloatArray, shares: FloatArray, own: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """(S, K) rows of the buildings (N, 2) about places (S, 2), without ``own`` (S, C), NO_MATCH pads: WITNESSES
+    at most, and one counts as the farther away the less likely the reference has it."""
+    count = min(len(points_m), LOOKED_AT)
+    away, rows = cKDTree(points_m).query(places_m, k=np.arange(1, count + 1))
+    ours = (rows[:, :, None] == own[:, None, :]).any(axis=2)
+    order = np.argsort(np.where(ours, math.inf, away / shares[rows]), axis=1, kind="stable")[:, :WITNESSES]
+    near = np.take_along_axis(np.where(ours, NO_MATCH, rows), order, axis=1)
+    return np.ascontiguousarray(near.astype(np.int64))
+
+
+def witnesses(query: QueryMap, triangles: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(S, W) buildings of the map, WITNESSES at most, about each triangle or pair (S, K), its corners left
+    out: near ones that the reference likely has first; NO_MATCH pads."""
+    if not len(triangles):
+        return np.empty((0, WITNESSES), dtype=np.int64)
+    return _nearest(query.points_m[triangles].mean(axis=1), query.points_m, query.shares, triangles)
 
 
 @njit(nogil=True, cache=True, inline="always")
@@ -308,7 +299,7 @@ def seed_evidence(
     """(H,) nats for hypotheses: the map's triangle (or pair) ``stars[h]``, a row of ``triangles`` (S, K),
     lies on places (H, K, 2). One that has sunk below ``hopeless`` is given up."""
     out = np.empty(len(stars))
-    others = witnesses(query, triangles, config)
+    others = witnesses(query, triangles)
     parts = np.array_split(np.arange(len(stars)), THREADS)
 
     def work(part: NDArray[np.int64]) -> None:

@@ -113,7 +113,7 @@ def pair_hypotheses(
     turns = (theirs[:, 1] - theirs[:, 0]) / (ends[:, 1] - ends[:, 0])
     corners, corner_places = np.empty((len(places), 3), dtype=np.int64), np.empty((len(places), 3, 2))
     _thirds(
-        query.points_m, pairs[numbers], witnesses(query, pairs, config)[numbers], turns, places, *where,
+        query.points_m, pairs[numbers], witnesses(query, pairs)[numbers], turns, places, *where,
         GATE_SIGMAS * math.sqrt(2.0) * config.sigma_m, corners, corner_places,
     )  # fmt: skip
     whole = corners[:, 2] >= 0
