@@ -96,8 +96,8 @@ def density_at(points_m: FloatArray, reference: Ground) -> FloatArray:
 @dataclass(frozen=True)
 class QueryMap:
     """Buildings of the map (N, 2) metres, their areas (N,) and the logarithms of these, with what probability
-    the reference has each of them (N,), and of each its NEIGHBOURS (N, K), near ones that the reference likely
-    has first."""
+    the reference has each of them (N,), and of each its neighbours (N, NEIGHBOURS): near ones that the
+    reference likely has first."""
 
     points_m: FloatArray
     areas_m2: FloatArray
@@ -138,8 +138,8 @@ def query_map(points_m: FloatArray, areas_m2: FloatArray, config: MatcherConfig)
 def _nearest(
     places_m: FloatArray, points_m: FloatArray, shares: FloatArray, own: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """(S, K) rows of the buildings (N, 2) about places (S, 2), without ``own`` (S, C), NO_MATCH pads: WITNESSES
-    at most, and one counts as the farther away the less likely the reference has it."""
+    """(S, WITNESSES) rows of the buildings (N, 2) about places (S, 2), at most, without ``own`` (S, C);
+    NO_MATCH pads. One counts as the farther away the less likely the reference has it."""
     count = min(len(points_m), LOOKED_AT)
     away, rows = cKDTree(points_m).query(places_m, k=np.arange(1, count + 1))
     ours = (rows[:, :, None] == own[:, None, :]).any(axis=2)
