@@ -28,6 +28,7 @@ from buildloc_matcher.pursuit import Agreement, Place
 from buildloc_matcher.reference.buildings import OUTLINE_UNIT_M
 from buildloc_matcher.reference.database import DatabaseError, ReferenceDatabase, descriptor_hash
 from buildloc_matcher.refinement import covariance_enu, refine
+from buildloc_matcher.reseeding import reseeded
 from buildloc_matcher.selection import Score, local_transform, pieces_of_one, select
 from buildloc_matcher.voting import Cluster, vote
 from buildloc_matcher.window import start
@@ -220,7 +221,13 @@ class Matcher:
             voters, corners = voters.joined(paired, len(corners)), np.concatenate([corners, ends])
         voters = voters.heaviest(max(config.top_k, MOST_GROWN // len(query.points_m)))
         nats = grown_nats(query, corners[voters.stars], voters.places_m, reference, config)
-        return voters.weighted(_likelihoods(nats)), corners
+        voters = voters.weighted(_likelihoods(nats))
+        if len(voters):
+            ends, again = reseeded(voters, query, reference, MOST_GROWN // len(query.points_m), config)
+            nats = grown_nats(query, ends[again.stars], again.places_m, reference, config)
+            voters = voters.joined(again.weighted(_likelihoods(nats)), len(corners))
+            corners = np.concatenate([corners, ends])
+        return voters, corners
 
     def _candidate(self, cluster: Cluster, score: Score, centre: FloatArray, query: QueryMap) -> Candidate:
         near = local_transform(score, centre, query, self.database.ground, self.config)
