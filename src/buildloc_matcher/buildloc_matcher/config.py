@@ -47,6 +47,7 @@ class MatcherConfig:
     second_look_places: int = param(
         200_000, "places where the second look tries pairs of buildings, at most; 0: none", 0, 100_000_000
     )
+    reseeded: int = param(100, "hypotheses around which seeds are laid anew, at most; 0: none", 0, 10_000)
     scale_gate: float = param(0.15, "largest deviation of the map-to-world scale from 1", 0.0, 0.9)
     sigma_m: float = param(2.0, "error of a map building against its neighbours, per axis, m", 0.1, 50.0)
     match_share: float = param(0.7, "share of the map's real buildings that the reference has", 0.05, 0.99)

@@ -35,7 +35,7 @@ from buildloc_matcher.window import start
 
 FEWEST_BUILDINGS = 4
 WARM_UP_BUILDINGS = 40
-MOST_GROWN = 400_000  # buildings of the matches that grow from hypotheses in a look
+MOST_GROWN = 400_000  # buildings of the matches that grow from hypotheses in a look, and of those laid anew
 SPARSE = 100  # buildings; a map of more has stars enough
 BEYOND_DOUBT = 600.0
 MOST_STARS = 4096  # of one look; those of a map of 100,000 buildings, matched, would fill 30 GB
@@ -212,7 +212,8 @@ class Matcher:
         self, hypotheses: Hypotheses, corners: NDArray[np.int64], query: QueryMap, places: int
     ) -> tuple[Hypotheses, NDArray[np.int64]]:
         """Hypotheses that vote with the likelihood of the match that grows from each, and the map's corners
-        that they number: those given with stars (S, 3), and those of pairs tried in so many places."""
+        that they number: those given with stars (S, 3), those of pairs tried in so many places, and those
+        laid anew around the likeliest."""
         config, reference = self.config, self.database.ground
         nats = seed_evidence(query, corners, hypotheses.stars, hypotheses.places_m, reference, config)
         voters = hypotheses.weighted(_likelihoods(nats))
@@ -222,12 +223,10 @@ class Matcher:
         voters = voters.heaviest(max(config.top_k, MOST_GROWN // len(query.points_m)))
         nats = grown_nats(query, corners[voters.stars], voters.places_m, reference, config)
         voters = voters.weighted(_likelihoods(nats))
-        if len(voters):
-            ends, again = reseeded(voters, query, reference, MOST_GROWN // len(query.points_m), config)
-            nats = grown_nats(query, ends[again.stars], again.places_m, reference, config)
-            voters = voters.joined(again.weighted(_likelihoods(nats)), len(corners))
-            corners = np.concatenate([corners, ends])
-        return voters, corners
+        ends, anew = reseeded(voters, query, reference, MOST_GROWN // len(query.points_m), config)
+        nats = grown_nats(query, ends, anew.places_m, reference, config)
+        voters = voters.joined(anew.weighted(_likelihoods(nats)), len(corners))
+        return voters, np.concatenate([corners, ends])
 
     def _candidate(self, cluster: Cluster, score: Score, centre: FloatArray, query: QueryMap) -> Candidate:
         near = local_transform(score, centre, query, self.database.ground, self.config)

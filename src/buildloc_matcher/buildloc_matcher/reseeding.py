@@ -1,7 +1,7 @@
-"""Better seeds where hypotheses already find something: a match that begins with a wrong corner goes astray.
+"""New seeds where hypotheses have found something: a match that begins with a wrong corner goes astray.
 
-Each of the likeliest hypotheses lays the whole map on the reference; every building of it, with the two
-neighbours that follow, is a new seed where all three come to lie beside buildings of the reference.
+A hypothesis lays the map on the reference. Of its buildings that come to lie beside one, triangles of
+neighbours are seeds in their turn: around a true hypothesis, however rough, some of them are right.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from buildloc_matcher.evidence import Ground, QueryMap
 from buildloc_matcher.hypotheses import Hypotheses
 from buildloc_matcher.point_grid import nearest
 
-RESOWN = 100  # hypotheses, at most
 FOUND = 3  # neighbours of a building, two of which make a seed with it
 
 
 @njit(nogil=True, cache=True)
 def _lay(query, near, centre, positions, turns, points, starts, frame, gate, corners, seats):  # type: ignore[no-untyped-def]
-    """Triangles of the map and the rows of the reference's grid beside their corners; how many there are."""
+    """Fill triangles of the map (M, 3) and the rows of the reference's grid beside their corners; how many
+    there are."""
     count, found = 0, np.empty(len(query), np.int64)
     beside = np.empty(FOUND, np.int64)
     for h in range(len(positions)):
@@ -51,13 +51,13 @@ def _lay(query, near, centre, positions, turns, points, starts, frame, gate, cor
 def reseeded(
     voters: Hypotheses, query: QueryMap, reference: Ground, most: int, config: MatcherConfig
 ) -> tuple[NDArray[np.int64], Hypotheses]:
-    """Corners (H, 3) of the map and new hypotheses with the same numbers, ``most`` at most, from the likeliest
-    voters, one of each voting bin."""
+    """Corners (H, 3) of the map and hypotheses with the same numbers, ``most`` at most, laid anew around the
+    likeliest voters, one of each voting bin. They have no votes yet."""
     order = np.argsort(-voters.weights, kind="stable")
     bins = np.round(voters.positions_m[order] / config.bin_size_m).astype(np.int64)
     _, first = np.unique(bins, axis=0, return_index=True)
     each = FOUND * (FOUND - 1) // 2 * len(query.points_m)
-    rows = order[np.sort(first)[: min(RESOWN, most // each)]]
+    rows = order[np.sort(first)[: min(config.reseeded, most // each)]]
     centre, grid = query.points_m.mean(axis=0), reference.grid
     corners = np.empty((each * len(rows), 3), dtype=np.int64)
     seats = np.empty_like(corners)
@@ -70,10 +70,10 @@ def reseeded(
     ours, theirs = query.points_m[corners] @ (1.0, 1.0j), places @ (1.0, 1.0j)
     middle, their_middle = ours.mean(axis=1), theirs.mean(axis=1)
     ours, theirs = ours - middle[:, None], theirs - their_middle[:, None]
-    turns = (np.conj(ours) * theirs).sum(axis=1) / (np.abs(ours) ** 2).sum(axis=1)
+    turns = (np.conj(ours) * theirs).sum(axis=1) / np.maximum((np.abs(ours) ** 2).sum(axis=1), 1e-9)
     moved = their_middle + turns * (centre @ (1.0, 1.0j) - middle)
     kept = np.abs(np.abs(turns) - 1.0) <= config.scale_gate
     return corners[kept], Hypotheses(
         np.arange(kept.sum()), places[kept], np.column_stack([moved.real, moved.imag])[kept],
-        np.angle(turns)[kept], np.abs(turns)[kept], np.ones(kept.sum()), mirrored=0, off_scale=0,
+        np.angle(turns)[kept], np.abs(turns)[kept], np.zeros(kept.sum()), mirrored=0, off_scale=0,
     )  # fmt: skip

@@ -89,6 +89,7 @@ ABLATIONS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
         "rigid selection": {"selection": "rigid"},
         "no second look": {"second_look": 0},
         "no pairs in the second look": {"second_look_places": 0},
+        "no seeds laid anew": {"reseeded": 0},
         "no building is invented": {"false_per_km2": 0.0},
         "all stars at first": {"max_stars": 0},
         "half the matches per star": {"matches_per_star": 50, "second_look_matches": 250},
