@@ -196,31 +196,13 @@ def _either(sure, doubtful):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _seed_evidence(  # type: ignore[no-untyped-def]
-    query,
-    shares,
-    sizes,
-    stars,
-    corners,
-    others,
-    places,
-    points,
-    starts,
-    frame,
-    density,
-    theirs,
-    usual,
-    sigma,
-    log_area,
-    area_share,
-    hopeless,
-    out,
-):
+def _seed_evidence(query, shares, sizes, stars, corners, others, places, around, hopeless, out):  # type: ignore[no-untyped-def]
     """Evidence of hypotheses: query triangle or pair ``corners[stars[h]]`` lies on ``places[h]`` (K, 2).
 
     The similarity of the corners is carried outwards over the witnesses and refitted with each that
     is found (running sums of a least-squares fit).
     """
+    points, starts, frame, density, theirs, usual, sigma, log_area, area_share = around
     held = np.empty(corners.shape[1] + others.shape[1], np.int64)
     for h in range(len(stars)):
         s, holds = stars[h], 0
@@ -307,7 +289,7 @@ def seed_evidence(
             rows = slice(part[0], part[-1] + 1)
             _seed_evidence(
                 query.points_m, query.shares, query.sizes, stars[rows], triangles, others, places_m[rows],
-                *surroundings(reference, config), hopeless, out[rows],
+                surroundings(reference, config), hopeless, out[rows],
             )  # fmt: skip
 
     with ThreadPoolExecutor(THREADS) as pool:

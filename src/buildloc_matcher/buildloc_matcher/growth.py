@@ -133,37 +133,13 @@ def _settle(j, place, state, taken):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _grow(  # type: ignore[no-untyped-def]
-    query,
-    shares,
-    sizes,
-    near,
-    corners,
-    places,
-    a,
-    b,
-    points,
-    starts,
-    frame,
-    density,
-    theirs,
-    usual,
-    sigma,
-    log_area,
-    area_share,
-    taken,
-    state,
-    predicted,
-):
+def _grow(about, corners, places, a, b, around, taken, state, predicted):  # type: ignore[no-untyped-def]
     """Fill ``state`` (N,) and ``predicted`` (N, 2) from corners that lie on ``places``; the evidence of the
     places and of the areas.
 
     ``taken`` counts the buildings of the map on every place; zero before and after.
     """
-    total = _grown_evidence(
-        query, shares, sizes, near, corners, places, a, b, points, starts, frame, density, theirs, usual,
-        sigma, log_area, area_share, taken, state, predicted,
-    )  # fmt: skip
+    total = _grown_evidence(about, corners, places, a, b, around, taken, state, predicted)
     for place in state:
         if place >= 0:
             taken[place] = 0
@@ -171,28 +147,9 @@ def _grow(  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _grown_evidence(  # type: ignore[no-untyped-def]
-    query,
-    shares,
-    sizes,
-    near,
-    corners,
-    places,
-    a,
-    b,
-    points,
-    starts,
-    frame,
-    density,
-    theirs,
-    usual,
-    sigma,
-    log_area,
-    area_share,
-    taken,
-    state,
-    predicted,
-):
+def _grown_evidence(about, corners, places, a, b, around, taken, state, predicted):  # type: ignore[no-untyped-def]
+    query, shares, sizes, near = about
+    points, starts, frame, density, theirs, usual, sigma, log_area, area_share = around
     count = len(query)
     turn = np.empty((count, 2))
     support = np.zeros(count, np.int64)
@@ -254,24 +211,8 @@ def _grown_evidence(  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _grown_nats(  # type: ignore[no-untyped-def]
-    query,
-    shares,
-    sizes,
-    near,
-    corners,
-    places,
-    points,
-    starts,
-    frame,
-    density,
-    theirs,
-    usual,
-    sigma,
-    log_area,
-    area_share,
-    out,
-):
+def _grown_nats(about, corners, places, around, out):  # type: ignore[no-untyped-def]
+    query, (points, starts, frame) = about[0], around[:3]
     taken = np.zeros(len(points), np.int32)
     state, predicted, seats = np.empty(len(query), np.int64), np.empty((len(query), 2)), np.empty(3, np.int64)
     for h in range(len(corners)):
@@ -283,10 +224,14 @@ def _grown_nats(  # type: ignore[no-untyped-def]
             u, v = places[h, m, 0] - places[h, k, 0], places[h, m, 1] - places[h, k, 1]
             a, b, squares = a + x * u + y * v, b + x * v - y * u, squares + x * x + y * y
         nats, alike = _grow(
-            query, shares, sizes, near, corners[h], seats, a / squares, b / squares, points, starts, frame,
-            density, theirs, usual, sigma, log_area, area_share, taken, state, predicted,
-        )  # fmt: skip
+            about, corners[h], seats, a / squares, b / squares, around, taken, state, predicted
+        )
         out[h] = nats + alike
+
+
+def _about(query: QueryMap) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.int64]]:
+    """What the compiled loops take of a map."""
+    return query.points_m, query.shares, query.sizes, query.neighbours
 
 
 def grown_nats(
@@ -299,12 +244,11 @@ def grown_nats(
     """(C,) nats, of places and areas, of the match that grows from each seed, corners (C, 3) on places
     (C, 3, 2)."""
     out = np.empty(len(corners))
+    about, around = _about(query), surroundings(reference, config)
 
     def work(part: NDArray[np.int64]) -> None:
-        _grown_nats(
-            query.points_m, query.shares, query.sizes, query.neighbours, corners[part], places_m[part],
-            *surroundings(reference, config), nats := np.empty(len(part)),
-        )  # fmt: skip
+        nats = np.empty(len(part))
+        _grown_nats(about, corners[part], places_m[part], around, nats)
         out[part] = nats
 
     with ThreadPoolExecutor(THREADS) as pool:
@@ -329,8 +273,7 @@ def grow(
     edges, moved = np.roll(source, -1, 1) - source, np.roll(target, -1, 1) - target
     turns = (np.conj(edges) * moved).sum(axis=1) / np.maximum((np.abs(edges) ** 2).sum(axis=1), 1e-9)
     where = (reference.grid.points_m, reference.grid.starts, reference.grid.frame)
-    settings = surroundings(reference, config)
-    about = (query.points_m, query.shares, query.sizes, query.neighbours)
+    about, around = _about(query), surroundings(reference, config)
     states = np.empty((len(corners), len(query.points_m)), dtype=np.int64)
     taken = np.zeros(len(reference.buildings_m), dtype=np.int32)
     grown: list[tuple[int, Grown]] = []
@@ -340,7 +283,7 @@ def grow(
             continue
         state, predicted = states[len(grown)], np.empty((len(query.points_m), 2))
         start = (triangle, seats, turns[c].real, turns[c].imag)
-        nats, alike = _grow(*about, *start, *settings, taken, state, predicted)
+        nats, alike = _grow(about, *start, around, taken, state, predicted)
         if nats > 0.0:
             matched = np.where(state >= 0, reference.grid.order[np.maximum(state, 0)], NO_MATCH)
             grown.append((c, Grown(matched, predicted, nats, alike)))
