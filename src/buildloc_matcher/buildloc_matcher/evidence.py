@@ -170,13 +170,15 @@ def _is_at(point, place):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, inline="always")
-def _gain(squared, variance, gate, density, share):  # type: ignore[no-untyped-def]
-    """Log-likelihood ratio of one building: its nearest reference building at this squared distance, or
-    (negative) none within the gate."""
+def _gains(squared, variance, gate, density, share):  # type: ignore[no-untyped-def]
+    """Log-likelihood ratios of one building, with its share and with DOUBT of it: its nearest reference
+    building at this squared distance, or (negative) none within the gate."""
+    doubtful = DOUBT * share
     if squared < 0.0:  # what chance puts there is as likely either way
-        return math.log(1.0 - share * (1.0 - math.exp(-0.5 * gate * gate / variance)))
-    likely = share * math.exp(-0.5 * squared / variance) / (2.0 * math.pi * variance)
-    return math.log(likely / density * math.exp(math.pi * density * squared) + (1.0 - share))
+        within = 1.0 - math.exp(-0.5 * gate * gate / variance)
+        return math.log(1.0 - share * within), math.log(1.0 - doubtful * within)
+    ratio = math.exp(squared * (math.pi * density - 0.5 / variance)) / (2.0 * math.pi * variance * density)
+    return math.log(share * ratio + 1.0 - share), math.log(doubtful * ratio + 1.0 - doubtful)
 
 
 @njit(nogil=True, cache=True, inline="always")
@@ -236,9 +238,8 @@ def _seed_evidence(query, shares, sizes, stars, corners, others, places, around,
             for k in range(corners.shape[1]):
                 if place >= 0 and _is_at(points[place], places[h, k]):
                     place = NO_MATCH
-            apart = squared if place >= 0 else -1.0
-            sure += _gain(apart, variance, gate, here, shares[j])
-            doubtful += _gain(apart, variance, gate, here, DOUBT * shares[j])
+            gains = _gains(squared if place >= 0 else -1.0, variance, gate, here, shares[j])
+            sure, doubtful = sure + gains[0], doubtful + gains[1]
             if place >= 0:
                 alike = _alike(sizes[j], theirs[place], usual[place], log_area, area_share)
                 sure, doubtful = sure + alike, doubtful + alike
@@ -304,7 +305,7 @@ def _placed_evidence(moved, shares, points, starts, frame, density, sigma):  # t
     for j in range(len(moved)):
         place, squared = nearest(points, starts, frame, moved[j, 0], moved[j, 1], gate)
         here = _density(density, frame, moved[j, 0], moved[j, 1])
-        total += _gain(squared if place >= 0 else -1.0, sigma * sigma, gate, here, shares[j])
+        total += _gains(squared if place >= 0 else -1.0, sigma * sigma, gate, here, shares[j])[0]
     return total
 
 

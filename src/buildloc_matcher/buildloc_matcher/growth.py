@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from buildloc_matcher.config import MatcherConfig
 from buildloc_matcher.evidence import (
-    DOUBT,
     GATE_SIGMAS,
     MAX_GATE_M,
     NO_MATCH,
@@ -27,7 +26,7 @@ from buildloc_matcher.evidence import (
     _alike,
     _density,
     _either,
-    _gain,
+    _gains,
     surroundings,
 )
 from buildloc_matcher.matching import THREADS
@@ -179,8 +178,8 @@ def _grown_evidence(about, corners, places, a, b, around, taken, state, predicte
         _settle(j, place, state, taken)
         matched = state[j] >= 0
         here = _density(density, frame, x, y)
-        sure += _gain(squared if matched else -1.0, variance, gate, here, shares[j])
-        doubtful += _gain(squared if matched else -1.0, variance, gate, here, DOUBT * shares[j])
+        gains = _gains(squared if matched else -1.0, variance, gate, here, shares[j])
+        sure, doubtful = sure + gains[0], doubtful + gains[1]
         if matched:
             alike += _alike(sizes[j], theirs[place], usual[place], log_area, area_share)
             _turn(j, query, near, state, points, turn, a, b)
@@ -202,8 +201,8 @@ def _grown_evidence(about, corners, places, a, b, around, taken, state, predicte
             _settle(j, place, state, taken)
             matched = state[j] >= 0
             here = _density(density, frame, x, y)
-            sure += _gain(squared if matched else -1.0, variance, gate, here, shares[j])
-            doubtful += _gain(squared if matched else -1.0, variance, gate, here, DOUBT * shares[j])
+            gains = _gains(squared if matched else -1.0, variance, gate, here, shares[j])
+            sure, doubtful = sure + gains[0], doubtful + gains[1]
             if matched:
                 alike += _alike(sizes[j], theirs[place], usual[place], log_area, area_share)
                 _turn(j, query, near, state, points, turn, a, b)
