@@ -232,7 +232,7 @@ NO_FIX: dict[str, tuple[list[Polygon], str]] = {
     "one building": (MAP[:1], "map has 1 buildings, fewer than 12"),
     "two buildings": (MAP[:2], "map has 2 buildings, fewer than 12"),
     "sheds": ([square(20.0 * i, 7.0 * i * i, 4.0) for i in range(30)], "map has 0 buildings, fewer than 12"),
-    "on a line": ([square(30.0 * i, 0.0) for i in range(30)], "no candidate"),
+    "on a line": ([square(30.0 * i, 0.0) for i in range(30)], "rejected: "),
     "in one place": ([square(0.0, 0.0)] * 30, "no candidate"),
     "in one place, of all sizes": ([square(-i, -i, 2.0 * i) for i in range(3, 40)], "no candidate"),
     "another town": (elsewhere(), ""),
