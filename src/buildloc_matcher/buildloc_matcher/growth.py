@@ -271,8 +271,8 @@ def grow(
     source, target = xy[..., 0] + 1j * xy[..., 1], places_m[..., 0] + 1j * places_m[..., 1]
     edges, moved = np.roll(source, -1, 1) - source, np.roll(target, -1, 1) - target
     turns = (np.conj(edges) * moved).sum(axis=1) / np.maximum((np.abs(edges) ** 2).sum(axis=1), 1e-9)
-    where = (reference.grid.points_m, reference.grid.starts, reference.grid.frame)
     about, around = _about(query), surroundings(reference, config)
+    where = around[:3]
     states = np.empty((len(corners), len(query.points_m)), dtype=np.int64)
     taken = np.zeros(len(reference.buildings_m), dtype=np.int32)
     grown: list[tuple[int, Grown]] = []

@@ -28,7 +28,7 @@ USED_OFTEN = 3  # pairs of one building, so that not all of them fail with it
 def choose_pairs(query: QueryMap, reference: Ground) -> NDArray[np.int64]:
     """(P, 2) buildings of the map: pairs that the reference likely has, and few others like them, first; of
     each the rarer building."""
-    sizes, theirs = np.log(query.areas_m2), np.sort(np.log(reference.areas_m2))
+    sizes, theirs = query.sizes, np.sort(reference.sizes)
     alike = np.searchsorted(theirs, sizes + LOG_AREA_OFF) - np.searchsorted(theirs, sizes - LOG_AREA_OFF)
     ends = np.array([(i, k) for i, near in enumerate(query.neighbours.tolist()) for k in near])
     ends = np.unique(np.sort(ends, axis=1), axis=0)
@@ -95,12 +95,12 @@ def pair_hypotheses(
     """Corners (H, 3) of the map, and the hypotheses with the same numbers whose surroundings speak for them,
     of pairs that are tried in so many places at most; their votes are their likelihoods."""
     pairs, grid = choose_pairs(query, reference), reference.grid
-    where, sizes = (grid.points_m, grid.starts, grid.frame), np.log(reference.areas_m2[grid.order])
+    where = (grid.points_m, grid.starts, grid.frame)
     tried = [np.empty((0, 2), dtype=np.int64)]
     for pair in pairs:
         length = float(np.hypot(*(query.points_m[pair[1]] - query.points_m[pair[0]])))
-        first, second = np.log(query.areas_m2[pair])
-        like = _like(length, LENGTH_OFF_M + LENGTH_OFF * length, first, second, sizes, *where)
+        first, second = query.sizes[pair]
+        like = _like(length, LENGTH_OFF_M + LENGTH_OFF * length, first, second, reference.sizes, *where)
         if sum(map(len, tried)) + len(like) > most:
             break
         tried.append(like)
