@@ -32,22 +32,24 @@ def batch(seed: int, count: int = 2, side: int = 64) -> tuple[Any, Any, Any]:
     return torch.from_numpy(rgb), torch.from_numpy(target), torch.ones((count, 1, side, side))
 
 
-def trained(name: str, steps: int, total: int = 30) -> tuple[Any, list[float]]:
+def trained(name: str, steps: int, bfloat16: bool = False) -> tuple[Any, list[float]]:
     from networks import network
     from train import Training
 
     torch.manual_seed(0)
-    training = Training(network(name), total, torch.device("cpu"))
+    training = Training(network(name), 30, torch.device("cpu"), bfloat16=bfloat16)
     training.net.train()
     return training, [float(training.advance(*batch(step))[0].sum()) for step in range(steps)]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["lite0", "segformer-b0"])
-def test_a_network_learns_squares_and_exports_what_it_learnt(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "bfloat16"), [("lite0", False), ("lite0", True), ("segformer-b0", False)])
+def test_a_network_learns_squares_and_exports_what_it_learnt(
+    name: str, bfloat16: bool, tmp_path: Path
+) -> None:
     from export import parity, write_onnx
 
-    training, losses = trained(name, 20)
+    training, losses = trained(name, 20, bfloat16)
     assert max(losses[-4:]) < min(losses[:4])
     path = tmp_path / "model.onnx"
     write_onnx(training.average, path, {"places": ["squares"]})
@@ -127,7 +129,8 @@ def test_the_papers_network_is_exported_and_runs(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_netvlads_branches_learn_and_export_what_they_learnt(tmp_path: Path) -> None:
+@pytest.mark.parametrize("bfloat16", [False, True])
+def test_netvlads_branches_learn_and_export_what_they_learnt(bfloat16: bool, tmp_path: Path) -> None:
     from netvlad import RADIUS_M, DualBranch, Ground, Training, draw_pairs, export
 
     torch.manual_seed(0)
@@ -138,7 +141,7 @@ def test_netvlads_branches_learn_and_export_what_they_learnt(tmp_path: Path) -> 
     pairs = draw_pairs(ground, 12, rng)
     assert pairs.views.shape == (12, 2, 64, 64) and pairs.tiles.shape == (12, 1, 64, 64)
     assert not pairs.views[:, 0][pairs.views[:, 1] == 0.0].any()  # nothing is seen outside the frame
-    training = Training(DualBranch(), 120, torch.device("cpu"))
+    training = Training(DualBranch(), 120, torch.device("cpu"), bfloat16)
     losses = [math.prod(training.advance(draw_pairs(ground, 16, rng))) for _ in range(18)]  # of all triplets
     assert np.mean(losses[-4:]) < 0.8 * np.mean(losses[:4])
     assert max(export(training.net, tmp_path, pairs).values()) < 1e-4
@@ -150,7 +153,7 @@ def test_netvlads_branches_learn_and_export_what_they_learnt(tmp_path: Path) -> 
     assert views.shape == tiles.shape == (12, 4096)
     np.testing.assert_allclose(np.linalg.norm(views, axis=1), 1.0, atol=1e-5)
     training.save(tmp_path / "checkpoint.pt", {"seed": 1})
-    resumed = Training(DualBranch(), 120, torch.device("cpu"))
+    resumed = Training(DualBranch(), 120, torch.device("cpu"), bfloat16)
     resumed.restore(tmp_path / "checkpoint.pt", {"seed": 1})
     np.testing.assert_allclose(resumed.advance(pairs), training.advance(pairs), atol=1e-5)
 

@@ -29,7 +29,7 @@ from buildloc_eval.segmentation_errors import Outlines, SegmentationErrors, perc
 from export import OPSET
 from torch import Tensor, nn
 from torch.nn import functional
-from train import EVERY, learning_rate
+from train import BFLOAT16_HELP, EVERY, learning_rate
 
 # Framingham and Ashland (east, north; EPSG 32619), 10 and 15 km from the nearest flight.
 TRAIN_M, HELD_OUT_M = (301_000.0, 4_685_000.0), (298_000.0, 4_679_000.0)
@@ -108,11 +108,12 @@ class NetVlad(nn.Module):
             self.assign.bias.zero_()  # type: ignore[union-attr]
 
     def forward(self, x: Tensor) -> Tensor:
-        """See the class; of length 1."""
-        x = functional.normalize(self.project(x), dim=1)
-        share = self.assign(x).flatten(2).softmax(dim=1)  # (n, clusters, places)
-        sums = share @ x.flatten(2).transpose(1, 2) - share.sum(dim=2, keepdim=True) * self.centres
-        return functional.normalize(functional.normalize(sums, dim=2).flatten(1), dim=1)
+        """See the class; of length 1. In float32, whatever the backbone computes in."""
+        with torch.autocast(x.device.type, enabled=False):
+            x = functional.normalize(self.project(x.float()), dim=1)
+            share = self.assign(x).flatten(2).softmax(dim=1)  # (n, clusters, places)
+            sums = share @ x.flatten(2).transpose(1, 2) - share.sum(dim=2, keepdim=True) * self.centres
+            return functional.normalize(functional.normalize(sums, dim=2).flatten(1), dim=1)
 
 
 class Branch(nn.Sequential):
@@ -223,8 +224,8 @@ def triplet_loss(views: Tensor, tiles: Tensor, places_m: Tensor) -> tuple[Tensor
 class Training:
     """Everything that a checkpoint holds."""
 
-    def __init__(self, net: DualBranch, steps: int, device: torch.device) -> None:
-        self.net = net.to(device)
+    def __init__(self, net: DualBranch, steps: int, device: torch.device, bfloat16: bool = False) -> None:
+        self.net, self.bfloat16 = net.to(device, memory_format=torch.channels_last), bfloat16
         self.optimiser = torch.optim.AdamW(net.parameters(), lr=0.0, weight_decay=1e-2)
         self.steps, self.step, self.seconds, self.device = steps, 0, 0.0, device
 
@@ -236,7 +237,9 @@ class Training:
         given = [
             torch.from_numpy(a).float().to(self.device) for a in (pairs.views, pairs.tiles, pairs.places_m)
         ]
-        loss, violating = triplet_loss(*self.net(*given[:2]), given[2])
+        with torch.autocast(self.device.type, torch.bfloat16, self.bfloat16):
+            described = self.net(*given[:2])
+        loss, violating = triplet_loss(*described, given[2])
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
@@ -330,6 +333,7 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=32)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--threads", type=int, default=0)
+    parser.add_argument("--bfloat16", action="store_true", help=BFLOAT16_HELP)
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
     if args.threads:
@@ -338,14 +342,15 @@ def main() -> None:
     cv2.setNumThreads(1)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     settings: dict[str, object] = {
-        "pretrained": str(args.pretrained or ""), "steps": args.steps, "batch": args.batch, "seed": args.seed
+        "pretrained": str(args.pretrained or ""), "steps": args.steps, "batch": args.batch, "seed": args.seed,
+        "bfloat16": args.bfloat16,
     }  # fmt: skip
     args.out.mkdir(parents=True, exist_ok=True)
     city, errors = read_boston(), read_errors(ERRORS_OF)
     held_out = draw_pairs(
         draw_ground(city, HELD_OUT_M, errors, 1, args.seed + 1), PROBES, np.random.default_rng(args.seed)
     )
-    training = Training(DualBranch(args.pretrained), args.steps, device)
+    training = Training(DualBranch(args.pretrained), args.steps, device, args.bfloat16)
     before = recall(training.net, held_out, device)
     print(f"held-out pairs before training: {before}", flush=True)
     if (args.out / "checkpoint.pt").exists():

@@ -25,12 +25,24 @@ SEGFORMERS = {  # Xie et al. 2021, table 6: depths of the four stages, decoder w
 IMAGENET_MEAN, IMAGENET_STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
 
 
+class _Depthwise(nn.Conv2d):
+    """In float32 whatever goes on around it: the gradients of some take three times as long in bfloat16."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        if not torch.is_autocast_enabled(x.device.type):
+            return super().forward(x)
+        with torch.autocast(x.device.type, enabled=False):
+            return super().forward(x.float())
+
+
 def _with_plain_convolutions(module: nn.Module) -> nn.Module:
     """Replace 'same padding' convolutions, fixed to one image size, by padded Conv2d ones."""
     for name, child in module.named_children():
         if isinstance(child, nn.Conv2d):
             kernel = child.kernel_size[0]
-            plain = nn.Conv2d(
+            slow = child.groups > 1 and (kernel == 5 or child.stride[0] == 2)
+            kind = _Depthwise if slow else nn.Conv2d
+            plain = kind(
                 child.in_channels, child.out_channels, kernel, child.stride[0], kernel // 2,
                 groups=child.groups, bias=child.bias is not None,
             )  # fmt: skip

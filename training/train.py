@@ -29,6 +29,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 STARTED_RATE = 0.3  # peak learning rate of weights that are trained already, over that of fresh ones
 COLUMNS = ("step", "loss", "building", "core", "learning_rate", "seconds")
 EVERY = 25
+BFLOAT16_HELP = "compute in bfloat16 where it is faster; weights and loss stay in float32"
 
 
 def segmentation_loss(logits: Tensor, target: Tensor, weight: Tensor) -> Tensor:
@@ -63,7 +64,12 @@ class Training:
     """Everything that a checkpoint holds."""
 
     def __init__(
-        self, net: BuildingNet | SegFormer, steps: int, device: torch.device, rate: float = 1.0
+        self,
+        net: BuildingNet | SegFormer,
+        steps: int,
+        device: torch.device,
+        rate: float = 1.0,
+        bfloat16: bool = False,
     ) -> None:
         self.net = net.to(device, memory_format=torch.channels_last)
         self.average = copy.deepcopy(self.net)
@@ -74,6 +80,7 @@ class Training:
             weight_decay=2e-2,
         )
         self.steps, self.step, self.seconds, self.device = steps, 0, 0.0, device
+        self.bfloat16 = bfloat16
         self.peaks = [rate * float(group["lr"]) for group in self.optimiser.param_groups]
 
     def advance(self, rgb: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, float]:
@@ -81,8 +88,9 @@ class Training:
         factor = learning_rate(self.step, self.steps)
         for group, peak in zip(self.optimiser.param_groups, self.peaks, strict=True):
             group["lr"] = peak * factor
-        logits = self.net(rgb.contiguous(memory_format=torch.channels_last))
-        loss = segmentation_loss(logits, target, weight)
+        with torch.autocast(self.device.type, torch.bfloat16, self.bfloat16):
+            logits = self.net(rgb.contiguous(memory_format=torch.channels_last))
+        loss = segmentation_loss(logits.float(), target, weight)
         self.optimiser.zero_grad(set_to_none=True)
         loss.sum().backward()
         nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
@@ -205,6 +213,7 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=8)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--threads", type=int, default=0)
+    parser.add_argument("--bfloat16", action="store_true", help=BFLOAT16_HELP)
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
     if args.threads:
@@ -215,13 +224,13 @@ def main() -> None:
     imagery = Path(os.environ.get("BUILDLOC_DATA", REPOSITORY / "../shared/data")) / "imagery"
     settings: dict[str, object] = {
         "places": args.places, "network": args.network, "steps": args.steps, "batch": args.batch,
-        "seed": args.seed,
+        "seed": args.seed, "bfloat16": args.bfloat16,
     }  # fmt: skip
     net = network(args.network, args.pretrained)
     if args.start:
         settings["start"] = started_from(args.start, args.places)
         take_weights(folded(net), args.start)
-    training = Training(net, args.steps, device, STARTED_RATE if args.start else 1.0)
+    training = Training(net, args.steps, device, STARTED_RATE if args.start else 1.0, args.bfloat16)
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / "settings.json").write_text(json.dumps(settings, indent=2) + "\n")
     if (args.out / "checkpoint.pt").exists():
