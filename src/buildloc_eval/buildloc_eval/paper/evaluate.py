@@ -43,9 +43,8 @@ from buildloc_eval.paper.plan import (
 from buildloc_eval.paper.report import Chapter, boston, write
 from buildloc_eval.paper.retrieval import predict_netvlad
 from buildloc_eval.paper.sources import measure, read_boston
-from buildloc_eval.paper.stages import Area, Progress, Say, Search, predict, side_by_side
+from buildloc_eval.paper.stages import Area, Job, Say, Search, predict, run_all, side_by_side
 from buildloc_eval.paper.store import Store
-from buildloc_eval.segmentation_errors import Outlines
 
 PARTS = ("boston", "tokyo", "real")
 FLOWN_OVER_M = 900.0  # around a flight's centre: what any of its frames may see
@@ -110,35 +109,43 @@ def city(buildings: Buildings, flight: PaperFlight) -> Area:
 
 def predict_all(stores: Stores, flights: Sequence[PaperFlight], plan: Plan, seed: int, say: Say) -> None:
     """Every prediction that is not there yet."""
-    kept, buildings = stores.ground.load("reference")
+    _, buildings = stores.ground.load("reference")
     seeds = range(seed, seed + plan.seeds)
     searches = [Search(flight, seeds, partial(city, buildings, flight)) for flight in flights]
     predict(stores, searches, plan, seed, say)
-    predict_brm(stores, flights, plan, seed, outlines_of(kept), say)
+    predict_brm(stores, flights, plan, seed, say)
 
 
-def predict_brm(
-    stores: Stores, flights: Sequence[PaperFlight], plan: Plan, seed: int, reference: Outlines, say: Say
-) -> None:
-    """BRM once per flight and seed, in the largest radius; the others are parts of it."""
-    store, centres = stores.predictions, shapely.get_coordinates(shapely.centroid(reference))
-    progress = Progress(say, "BRM", len(flights) * plan.seeds)
-    for flight in flights:
-        centre, largest = np.array(flight.centre_m), max(plan.radii_km)
-        ratios: brm.RatioMap | None = None
-        for s in range(seed, seed + plan.seeds):
-            asked = {
-                radius: prediction_name(BRM, radius, flight, s, prefixes=False) for radius in plan.radii_km
-            }
-            if not all(store.has(name) for name in asked.values()):
-                maps = stores.maps.load(maps_name(flight, s))
-                if ratios is None:
-                    near = np.hypot(*(centres - centre).T) <= 1000.0 * largest
-                    ratios = brm.ratio_map(reference[near], centre, 1000.0 * largest, maps.radii_m)
-                found, seconds = methods.brm_survivors(ratios, maps)
-                for radius, name in asked.items():
-                    store.save(name, methods.brm_prediction(found, seconds, centre, radius))
-            progress.step(maps_name(flight, s))
+def predict_brm(stores: Stores, flights: Sequence[PaperFlight], plan: Plan, seed: int, say: Say) -> None:
+    """BRM's predictions that are not there yet."""
+
+    def lacks(flight: PaperFlight, s: int) -> bool:
+        names = (prediction_name(BRM, radius, flight, s, prefixes=False) for radius in plan.radii_km)
+        return not all(stores.predictions.has(name) for name in names)
+
+    asked = {flight: [s for s in range(seed, seed + plan.seeds) if lacks(flight, s)] for flight in flights}
+    jobs: list[Job] = [
+        (flight.name, float(len(seeds)), partial(locate_brm, stores, flight, seeds, plan.radii_km))
+        for flight, seeds in asked.items()
+        if seeds
+    ]
+    for _ in run_all(jobs, BRM, say):
+        pass  # every prediction is kept as soon as it is made
+
+
+def locate_brm(stores: Stores, flight: PaperFlight, seeds: Sequence[int], radii_km: Sequence[int]) -> None:
+    """A flight once per seed, in the largest radius; the others are parts of it."""
+    limit_threads()
+    reference = outlines_of(stores.ground.load("reference")[0])
+    centre, largest_m = np.array(flight.centre_m), 1000.0 * max(radii_km)
+    away = np.hypot(*(shapely.get_coordinates(shapely.centroid(reference)) - centre).T)
+    regions_m = stores.maps.load(maps_name(flight, seeds[0])).radii_m  # the same for all seeds
+    ratios = brm.ratio_map(reference[away <= largest_m], centre, largest_m, regions_m)
+    for s in seeds:
+        found, seconds = methods.brm_survivors(ratios, stores.maps.load(maps_name(flight, s)))
+        for radius in radii_km:
+            name = prediction_name(BRM, radius, flight, s, prefixes=False)
+            stores.predictions.save(name, methods.brm_prediction(found, seconds, centre, radius))
 
 
 def boston_part(
