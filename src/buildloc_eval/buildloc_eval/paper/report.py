@@ -63,7 +63,7 @@ REAL = [
     "the paper's own figures are of seven real flights over Denver with Microsoft's footprints",
 ]
 TIMES = (
-    "wall-clock, with as many flights located at once as there are cores; BRM and NetVLAD alone, NetVLAD "
+    "wall-clock, with as many flights located at once as there are cores; NetVLAD alone, and "
     "without describing the reference's tiles"
 )
 NOT_DONE = ["NetVLAD has not been run: the paper's figures stand alone in its rows"]
