@@ -13,7 +13,10 @@ STYLE = (
     "body{font:15px sans-serif;max-width:80em;margin:2em auto;padding:0 1em}table{border-collapse:collapse}"
     "td,th{border:1px solid #ccc;padding:.2em .6em;text-align:left;vertical-align:top}img{max-width:100%}"
     "section{overflow-x:auto}h1{border-bottom:2px solid #ccc}"  # a table that is too wide scrolls by itself
+    "td.text{min-width:16em}"
 )
+
+LONG_TEXT = 30  # characters
 
 Pictures = Sequence[tuple[str, Path]]
 
@@ -65,10 +68,14 @@ def _rows(rows: list[dict[str, Any]]) -> str:
     """A table with a column for every key."""
     keys = list(dict.fromkeys(key for row in rows for key in row))
     head = "".join(f"<th>{html.escape(str(key))}</th>" for key in keys)
-    body = "".join(
-        "<tr>" + "".join(f"<td>{_cell(row.get(key))}</td>" for key in keys) + "</tr>" for row in rows
-    )
+    body = "".join("<tr>" + "".join(_column(row.get(key)) for key in keys) + "</tr>" for row in rows)
     return f"<table><tr>{head}</tr>{body}</table>"
+
+
+def _column(value: Any) -> str:
+    """Long text beside many figures would be a word wide."""
+    wide = ' class="text"' if isinstance(value, str) and len(value) > LONG_TEXT else ""
+    return f"<td{wide}>{_cell(value)}</td>"
 
 
 def write_report(

@@ -213,6 +213,6 @@ def real_imagery(
     }
     pictures = []
     if flights:
-        drawn = figures.draw_trajectories(out / "real_trajectories.png", around, paths)
+        drawn = figures.draw_trajectories(out / "trajectories.png", around, paths)
         pictures = [("Flights of the first seed over the outlines of the reference", drawn)]
     return Chapter("Real imagery", said, bars, pictures + convergence_pictures(out, traces))

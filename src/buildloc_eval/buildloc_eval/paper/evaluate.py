@@ -192,7 +192,9 @@ def real_part(
         network = found[flight.place]
         stores[flight.name] = real.stores_for(out, flight, network, models, seed)
         real.run(stores[flight.name], flight, network, city, plan, models, seed, say)
-    return real_imagery(out, stores, flights, found, left_out, plan, seed)
+    pictures = out / "real"
+    pictures.mkdir(exist_ok=True)
+    return real_imagery(pictures, stores, flights, found, left_out, plan, seed)
 
 
 def evaluate(
