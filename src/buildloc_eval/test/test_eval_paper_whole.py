@@ -128,5 +128,5 @@ def test_the_quick_run_on_real_data_writes_its_report(tmp_path: Path) -> None:
     assert {row["what"] for row in report["bars"]} >= {"default preset, recall@1 at 12 km"}
     assert "Seven flights over Boston" in text
     pictures = re.findall('src="data:image/png;base64,([^"]+)"', (tmp_path / "report.html").read_text())
-    assert len(pictures) > 10
-    assert len(set(pictures)) == len(pictures)  # no chapter draws over another's
+    # No chapter draws over another's.
+    assert len(set(pictures)) == len(pictures) == len(list(tmp_path.rglob("*.png"))) >= 5
