@@ -29,8 +29,6 @@ class _Depthwise(nn.Conv2d):
     """In float32 whatever goes on around it: the gradients of some take three times as long in bfloat16."""
 
     def forward(self, x: Tensor) -> Tensor:
-        if not torch.is_autocast_enabled(x.device.type):
-            return super().forward(x)
         with torch.autocast(x.device.type, enabled=False):
             return super().forward(x.float())
 

@@ -37,8 +37,8 @@ from buildloc_eval.paper.plan import (
     maps_name,
     measured_models,
     outlines_of,
-    prediction_name,
     ragged,
+    whole_names,
 )
 from buildloc_eval.paper.report import Chapter, boston, write
 from buildloc_eval.paper.retrieval import predict_netvlad
@@ -120,7 +120,7 @@ def predict_brm(stores: Stores, flights: Sequence[PaperFlight], plan: Plan, seed
     """BRM's predictions that are not there yet."""
 
     def lacks(flight: PaperFlight, s: int) -> bool:
-        names = (prediction_name(BRM, radius, flight, s, prefixes=False) for radius in plan.radii_km)
+        names = whole_names(BRM, flight, s, plan.radii_km).values()
         return not all(stores.predictions.has(name) for name in names)
 
     asked = {flight: [s for s in range(seed, seed + plan.seeds) if lacks(flight, s)] for flight in flights}
@@ -143,8 +143,7 @@ def locate_brm(stores: Stores, flight: PaperFlight, seeds: Sequence[int], radii_
     ratios = brm.ratio_map(reference[away <= largest_m], centre, largest_m, regions_m)
     for s in seeds:
         found, seconds = methods.brm_survivors(ratios, stores.maps.load(maps_name(flight, s)))
-        for radius in radii_km:
-            name = prediction_name(BRM, radius, flight, s, prefixes=False)
+        for radius, name in whole_names(BRM, flight, s, radii_km).items():
             stores.predictions.save(name, methods.brm_prediction(found, seconds, centre, radius))
 
 

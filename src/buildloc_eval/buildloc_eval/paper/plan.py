@@ -146,6 +146,11 @@ def prediction_name(method: str, radius_km: float, flight: Flight, seed: int, pr
     return f"{kind}_{method.replace(' ', '_')}_{radius_km:g}km_{maps_name(flight, seed)}"
 
 
+def whole_names(method: str, flight: Flight, seed: int, radii_km: Sequence[int]) -> dict[int, str]:
+    """Of the predictions of a whole flight, by radius."""
+    return {radius: prediction_name(method, radius, flight, seed, prefixes=False) for radius in radii_km}
+
+
 def ragged(outlines: Outlines) -> tuple[Any, ...]:
     """Outlines as arrays, which are kept and read much faster than objects."""
     return tuple(shapely.to_ragged_array(outlines))

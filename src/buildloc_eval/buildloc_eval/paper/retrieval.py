@@ -29,7 +29,7 @@ from buildloc_eval.paper.netvlad import (
     distances,
     keyframe_tile,
 )
-from buildloc_eval.paper.plan import Plan, Stores, maps_name, prediction_name
+from buildloc_eval.paper.plan import Plan, Stores, maps_name, whole_names
 from buildloc_eval.paper.scoring import BIN_M
 from buildloc_eval.paper.stages import Progress, Say
 from buildloc_eval.segmentation_errors import Outlines
@@ -122,9 +122,9 @@ def predict_netvlad(
     for number, (flight, seen) in enumerate(views.items()):
         told = (apart[number], grids[number], describing_s[number], comparing_s[number])
         for s, hypotheses, seconds in locate(seen, *told):
-            for radius in plan.radii_km:
+            for radius, name in whole_names(NETVLAD, flight, s, plan.radii_km).items():
                 kept = prediction(hypotheses, seconds, np.array(flight.centre_m), radius)
-                stores.of(NETVLAD).save(prediction_name(NETVLAD, radius, flight, s, prefixes=False), kept)
+                stores.of(NETVLAD).save(name, kept)
 
 
 def _views(stores: Stores, flight: PaperFlight, plan: Plan, seed: int, seen_by: SeenBy) -> dict[int, View]:
@@ -132,7 +132,7 @@ def _views(stores: Stores, flight: PaperFlight, plan: Plan, seed: int, seen_by: 
     gets its predictions here."""
     store, views = stores.of(NETVLAD), dict[int, View]()
     for s in range(seed, seed + plan.seeds):
-        names = [prediction_name(NETVLAD, radius, flight, s, prefixes=False) for radius in plan.radii_km]
+        names = whole_names(NETVLAD, flight, s, plan.radii_km).values()
         if all(store.has(name) for name in names):
             continue
         track, maps = stores.tracks.load(flight.name), stores.maps.load(maps_name(flight, s))
