@@ -11,7 +11,8 @@ import shapely
 from augment import augmented, coarse, colours, snow
 from buildloc_eval.places import Scene
 from crops import CROP_PX, ONE_HOUSE_M2, CropConfig, CropSampler, core
-from rendered import Canvas, block, decoys, rectangle, render
+from rendered import Canvas, rectangle
+from towns import block, decoys, render
 
 PLAIN = CropConfig(rendered_share=0.0, decoy_share=0.0)
 

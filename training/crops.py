@@ -11,7 +11,8 @@ import numpy as np
 from augment import augmented
 from buildloc_eval.places import Scene
 from numpy.typing import NDArray
-from rendered import Image, Labels, decoys, render
+from rendered import Image, Labels
+from towns import decoys, render
 
 TRAIN_GSD_M = 0.2  # what the network sees
 FINEST_GSD_M = 0.12  # scenes are kept no finer than this

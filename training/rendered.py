@@ -123,6 +123,7 @@ class Canvas:
     def __init__(self, side_px: int, gsd_m: float, rng: np.random.Generator) -> None:
         self.rng, self.side, self.gsd, self.light = rng, side_px, gsd_m, Light.drawn(rng)
         self.labels: Labels = np.zeros((side_px, side_px), dtype=np.int32)
+        self.roof_px: Image = np.zeros((side_px, side_px), dtype=np.float32)  # heights
         fine, coarse = noise(rng, side_px, 9), noise(rng, side_px, 81)
         first, second = GROUNDS[rng.integers(len(GROUNDS), size=2)]
         blend = 1.0 / (1.0 + np.exp(-rng.uniform(1.0, 4.0) * coarse))[:, :, None]
@@ -146,11 +147,13 @@ class Canvas:
         self.rgb[where] = colour + self.fine[where] * roughness
 
     def shade(self, outline: Points, height_px: float) -> None:
-        """Darken the ground that a body of this outline and height casts its shadow on."""
-        tip = outline + self.light.away * height_px * self.light.stretch
-        hull = cv2.convexHull(np.vstack([outline, tip]).astype(np.float32))[:, 0].astype(np.float64)
-        where = _where(_inside(self.labels.shape, hull), self.labels == 0)
-        self.rgb[where] *= self.light.shade
+        """Darken the ground that a body of this outline and height casts its shadow on, and much lower roofs
+        that it reaches."""
+        low = self.roof_px < 0.6 * height_px
+        for reach, lit in ((1.0, self.labels == 0), (0.5, (self.labels > 0) & low)):
+            tip = outline + self.light.away * height_px * self.light.stretch * reach
+            hull = cv2.convexHull(np.vstack([outline, tip]).astype(np.float32))[:, 0].astype(np.float64)
+            self.rgb[_where(_inside(self.labels.shape, hull), lit)] *= self.light.shade
 
     def car(self, centre: Points, angle: float) -> None:
         """A parked car."""
@@ -233,6 +236,25 @@ class Canvas:
         )
         self.paint(line, colour, 9.0)
 
+    def enclosure(self, centre: Points, angle: float) -> None:
+        """A garden, a bed or a court within a hedge or a low wall."""
+        length, width, thick = self.px(5.0, 16.0), self.px(4.0, 12.0), self.px(0.3, 1.4)
+        ring = rectangle(centre, length, width, angle)
+        self.shade(ring, self.px(0.6, 1.8))
+        green = np.array([50, 72, 38], dtype=np.float32) * np.float32(self.rng.uniform(0.6, 1.3))
+        self.paint(ring, green if self.rng.random() < 0.7 else self.paving(), 9.0)
+        ground = GROUNDS[self.rng.integers(len(GROUNDS))] if self.rng.random() < 0.7 else self.paving()
+        self.paint(rectangle(centre, length - 2.0 * thick, width - 2.0 * thick, angle), ground, 7.0)
+
+    def awning(self, centre: Points, angle: float) -> None:
+        """A canopy, pale or striped, over a terrace: cloth, and no building."""
+        outline = rectangle(centre, self.px(2.0, 6.0), self.px(1.5, 4.0), angle)
+        self.shade(outline, self.px(2.0, 2.6))
+        colour = np.array([226, 222, 212], dtype=np.float32) * np.float32(self.rng.uniform(0.7, 1.1))
+        if self.rng.random() < 0.3:
+            colour = colour * self.rng.uniform(0.4, 1.0, 3).astype(np.float32)
+        self.paint(outline, colour, 2.0)
+
     def terrace(self, centre: Points, angle: float) -> None:
         """A paved or decked yard with things on it."""
         length, width = self.px(3.0, 14.0), self.px(2.5, 8.0)
@@ -277,6 +299,33 @@ def _roof_faces(length: float, width: float, kind: str) -> list[tuple[Points, Po
     return faces
 
 
+def _roof_top(canvas: Canvas, footprint: NDArray[np.bool_], outline: Points, colour: Image) -> None:
+    """What stands on a flat roof that people use: parapet, head of the stairs, water tanks."""
+    rng, centre = canvas.rng, outline.mean(axis=0)
+    size = float(np.linalg.norm(outline[0] - outline[1])), float(np.linalg.norm(outline[1] - outline[2]))
+    angle = float(np.arctan2(*(outline[0] - outline[1])[::-1]))
+    inner = rectangle(centre, *(max(1.0, side - 2.0 * canvas.px(0.2, 0.5)) for side in size), angle)
+    floor = colour * np.float32(rng.uniform(0.65, 1.0)) if rng.random() < 0.6 else canvas.paving()
+    where = _where(_inside(footprint.shape, inner), footprint)
+    canvas.rgb[where] = floor + canvas.fine[where] * np.float32(rng.uniform(2.0, 9.0))
+    turns = np.linspace(0.0, math.tau, 12, endpoint=False)
+    disc = np.column_stack([np.cos(turns), np.sin(turns)])
+    tank = np.float32(rng.choice((30.0, 90.0, 225.0)))
+    for _ in range(rng.integers(0, 5)):
+        spot = centre + (inner[rng.integers(4)] - centre) * rng.uniform(0.0, 0.85)
+        if rng.random() < 0.3:
+            body = rectangle(spot, canvas.px(2.0, 4.5), canvas.px(1.8, 3.5), angle)
+            height = canvas.px(1.5, 3.0)
+            paint = colour * np.float32(rng.uniform(0.8, 1.3))
+        else:
+            body, height = spot + disc * canvas.px(0.4, 0.9), canvas.px(0.8, 1.8)
+            paint = np.full(3, tank, dtype=np.float32)
+        tip = body + canvas.light.away * height * canvas.light.stretch
+        hull = cv2.convexHull(np.vstack([body, tip]).astype(np.float32))[:, 0].astype(np.float64)
+        canvas.rgb[_where(_inside(footprint.shape, hull), footprint)] *= canvas.light.shade
+        canvas.rgb[_where(_inside(footprint.shape, body), footprint)] = paint
+
+
 def _roof_colour(rng: np.random.Generator) -> Image:
     """Of one roof."""
     return ROOFS[rng.integers(len(ROOFS))] * rng.uniform(0.7, 1.25) + rng.uniform(-12, 12, 3).astype(
@@ -317,7 +366,7 @@ def building(canvas: Canvas, number: int, centre: Points, length: float, width: 
     kind = str(rng.choice(("gable", "hip", "flat", "shed"), p=(0.45, 0.2, 0.25, 0.1)))
     stripes, amplitude = rng.uniform(0.25, 1.2) / canvas.gsd, rng.uniform(0.0, 0.12)
     contrast = rng.uniform(0.2, 1.2) * (1.0 - canvas.light.shade)
-    colour = _roof_colour(rng)
+    colour, used = _roof_colour(rng), rng.random() < 0.6
     for at, long, wide, a in wings:
         if rng.random() < 0.25:
             colour = _roof_colour(rng)
@@ -328,7 +377,10 @@ def building(canvas: Canvas, number: int, centre: Points, length: float, width: 
             along = columns * math.cos(a) + rows * math.sin(a)
             ribs = 1.0 + amplitude * np.sin(along * (math.tau / max(stripes, 2.2)))
             canvas.rgb[where] = colour * lit * ribs[:, None] + canvas.fine[where] * rng.uniform(1.0, 8.0)
+        if kind == "flat" and used:
+            _roof_top(canvas, footprint, rectangle(at, long, wide, a), colour)
     canvas.labels[footprint] = number
+    canvas.roof_px[footprint] = height
     for _ in range(rng.integers(0, 5)):  # chimneys, skylights, panels
         spot = centre + turn @ (rng.uniform(-0.4, 0.4, 2) * (length, width))
         size = (
@@ -362,76 +414,7 @@ def annexes(canvas: Canvas, centre: Points, length: float, width: float, angle: 
             canvas.terrace(at, angle)
         else:
             canvas.paint(rectangle(at, long, wide, angle), canvas.paving(), rng.uniform(2.0, 6.0))
+        if rng.random() < 0.2:
+            canvas.awning(at, angle)
         if rng.random() < 0.3:
             canvas.car(at, angle + rng.choice((0.0, math.pi / 2.0)))
-
-
-def block(canvas: Canvas, angle: float) -> list[tuple[Points, float, float, float]]:
-    """A block of a dense town: two rows of houses that touch, back to back. Centre, length, width, angle."""
-    rng = canvas.rng
-    along = np.array([math.cos(angle), math.sin(angle)])
-    across = np.array([-along[1], along[0]])
-    corner, depth, plans = canvas.place(), canvas.px(6.0, 14.0), []
-    for side in (-1.0, 1.0):
-        front = -canvas.px(0.0, 4.0)
-        for _ in range(rng.integers(3, 9)):
-            length, width = canvas.px(4.0, 11.0), depth * rng.uniform(0.7, 1.0)
-            centre = corner + along * (front + length / 2.0) + across * side * width / 2.0
-            plans.append((centre, length, width, angle))
-            front += length
-    return plans
-
-
-def render(side_px: int, gsd_m: float, rng: np.random.Generator) -> tuple[Image, Labels]:
-    """A square of a town nobody knows: RGB (side, side, 3) 0-255 and labels (side, side)."""
-    canvas = Canvas(side_px, gsd_m, rng)
-    angle = rng.uniform(0.0, math.pi)
-    for _ in range(rng.integers(0, 4)):
-        canvas.paint(
-            rectangle(canvas.place(), canvas.px(8, 40), canvas.px(8, 40), angle),
-            GROUNDS[rng.integers(len(GROUNDS))] * rng.uniform(0.8, 1.2), 8.0,
-        )  # fmt: skip
-    for _ in range(rng.integers(0, 3)):
-        canvas.road(canvas.place(), angle + rng.choice((0.0, math.pi / 2.0)) + rng.normal(0.0, 0.1))
-    for _ in range(rng.integers(0, 3)):
-        canvas.car_park(canvas.place(), angle)
-    dense = rng.random() < 0.35
-    count, number = int(rng.integers(4, 26) if dense else rng.integers(0, 9)), 0
-    plans = []
-    while len(plans) < count:
-        length, width = canvas.px(5.0, 18.0), canvas.px(4.0, 11.0)
-        if rng.random() < 0.1:
-            length, width = canvas.px(18.0, 45.0), canvas.px(9.0, 22.0)
-        at, own = canvas.place(), angle + rng.choice((0.0, math.pi / 2.0)) + rng.normal(0.0, 0.12)
-        row = int(rng.integers(2, 6)) if rng.random() < (0.7 if dense else 0.1) else 1  # a terrace of houses
-        step = np.array([math.cos(own), math.sin(own)]) * length
-        plans += [(at + step * k, length, width * rng.uniform(0.85, 1.15), own) for k in range(row)]
-    for plan in plans:
-        annexes(canvas, *plan)
-    for _ in range(rng.integers(1, 6) if dense else 0):
-        plans += block(canvas, angle + rng.choice((0.0, math.pi / 2.0)) + rng.normal(0.0, 0.05))
-    for thing, most in ((canvas.pool, 3), (canvas.hedge, 6), (canvas.terrace, 3)):
-        for _ in range(rng.integers(0, most)):
-            thing(canvas.place(), angle + rng.choice((0.0, math.pi / 2.0)))
-    for plan in plans:
-        number += building(canvas, number + 1, *plan)
-    for _ in range(int(rng.exponential(6.0))):
-        canvas.tree(canvas.place(), canvas.px(1.0, 5.0))
-    if rng.random() < 0.2:  # a wood
-        edge = canvas.place()
-        for _ in range(40):
-            canvas.tree(edge + rng.normal(0.0, 0.18 * side_px, 2), canvas.px(1.5, 4.0))
-    return np.clip(canvas.rgb, 0.0, 255.0).astype(np.float32), canvas.labels
-
-
-def decoys(rgb: Image, labels: Labels, gsd_m: float, rng: np.random.Generator) -> Image:
-    """A real picture with pavings, car parks and cars drawn on its ground: none of them is a building."""
-    canvas = Canvas(len(rgb), gsd_m, rng)
-    canvas.rgb, canvas.labels = rgb.copy(), labels
-    angle = rng.uniform(0.0, math.pi)
-    for _ in range(rng.integers(1, 5)):
-        drawers = (canvas.yard, canvas.car_park, canvas.pool, canvas.terrace, canvas.hedge)
-        drawers[rng.integers(len(drawers))](canvas.place(), angle)
-    for _ in range(rng.integers(0, 4)):
-        canvas.car(canvas.place(), angle)
-    return canvas.rgb

@@ -214,6 +214,10 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--threads", type=int, default=0)
     parser.add_argument("--bfloat16", action="store_true", help=BFLOAT16_HELP)
+    parser.add_argument(
+        "--closing", type=float, default=CropConfig.closing,
+        help="share of the run, at its end, with crops near to what a camera brings; 1 for known ground",
+    )  # fmt: skip
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
     if args.threads:
@@ -224,7 +228,7 @@ def main() -> None:
     imagery = Path(os.environ.get("BUILDLOC_DATA", REPOSITORY / "../shared/data")) / "imagery"
     settings: dict[str, object] = {
         "places": args.places, "network": args.network, "steps": args.steps, "batch": args.batch,
-        "seed": args.seed, "bfloat16": args.bfloat16,
+        "seed": args.seed, "bfloat16": args.bfloat16, "closing": args.closing,
     }  # fmt: skip
     net = network(args.network, args.pretrained)
     if args.start:
@@ -236,7 +240,7 @@ def main() -> None:
     if (args.out / "checkpoint.pt").exists():
         training.restore(args.out / "checkpoint.pt", settings)
         print(f"going on from step {training.step}")
-    sampler = CropSampler(scenes_of(args.places, imagery), CropConfig(), args.seed)
+    sampler = CropSampler(scenes_of(args.places, imagery), CropConfig(closing=args.closing), args.seed)
     train(training, sampler, args.batch, args.out, settings)
     print(f"{args.out}: {training.step} steps in {training.seconds / 60:.1f} min")
 

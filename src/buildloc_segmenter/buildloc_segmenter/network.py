@@ -336,6 +336,8 @@ def _load(path: Path, config: SegmenterConfig) -> onnxruntime.InferenceSession:
 def _start(path: Path, config: SegmenterConfig, providers: list[str]) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = config.threads
+    # Threads that spin between two inferences take the cores from everything else that runs on them.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = 4  # what goes wrong is raised or told by _load
     try:
         # Its own fallback prints a banner; the next provider is ours to try.
