@@ -27,6 +27,7 @@ from buildloc_eval.paper.netvlad import BRANCHES, FINE, PIXEL_M, SIDE_PX, STEP_M
 from buildloc_eval.paper.sources import read_boston
 from buildloc_eval.segmentation_errors import Outlines, SegmentationErrors, perceive, read_errors
 from export import OPSET
+from runs import Run
 from torch import Tensor, nn
 from torch.nn import functional
 from train import BFLOAT16_HELP, EVERY, learning_rate
@@ -221,13 +222,13 @@ def triplet_loss(views: Tensor, tiles: Tensor, places_m: Tensor) -> tuple[Tensor
     return excess.sum() / violating.clamp(min=1), violating / others.sum().clamp(min=1)
 
 
-class Training:
-    """Everything that a checkpoint holds."""
+class Training(Run):
+    """Both branches in training."""
 
     def __init__(self, net: DualBranch, steps: int, device: torch.device, bfloat16: bool = False) -> None:
         self.net, self.bfloat16 = net.to(device, memory_format=torch.channels_last), bfloat16
         self.optimiser = torch.optim.AdamW(net.parameters(), lr=0.0, weight_decay=1e-2)
-        self.steps, self.step, self.seconds, self.device = steps, 0, 0.0, device
+        super().__init__({"net": self.net, "optimiser": self.optimiser}, steps, device)
 
     def advance(self, pairs: Pairs) -> tuple[float, float]:
         """One step; the loss and the share of violating triplets before it."""
@@ -246,25 +247,6 @@ class Training:
         self.optimiser.step()
         self.step += 1
         return float(loss.detach()), float(violating)
-
-    def save(self, path: Path, settings: dict[str, object]) -> None:
-        """Write the checkpoint; a run that is killed meanwhile keeps the earlier one."""
-        state = {
-            "net": self.net.state_dict(), "optimiser": self.optimiser.state_dict(), "step": self.step,
-            "seconds": self.seconds, "settings": settings,
-        }  # fmt: skip
-        part = path.with_suffix(".part")
-        torch.save(state, part)
-        part.replace(path)
-
-    def restore(self, path: Path, settings: dict[str, object]) -> None:
-        """Go on from a checkpoint. Raises SystemExit when it was made with other settings."""
-        state = torch.load(path, map_location=self.device, weights_only=True)
-        if state["settings"] != settings:
-            raise SystemExit(f"{path}: was made with {state['settings']}; choose another --out, or remove it")
-        self.net.load_state_dict(state["net"])
-        self.optimiser.load_state_dict(state["optimiser"])
-        self.step, self.seconds = state["step"], state["seconds"]
 
 
 @torch.no_grad()

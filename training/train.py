@@ -22,6 +22,7 @@ from crops import CropConfig, CropSampler
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from networks import BuildingNet, SegFormer, folded, network, take_weights
+from runs import Run
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -60,8 +61,8 @@ def learning_rate(step: int, steps: int) -> float:
     return min(1.0, (step + 1) / 40.0) * 0.5 * (1.0 + math.cos(math.pi * step / steps))
 
 
-class Training:
-    """Everything that a checkpoint holds."""
+class Training(Run):
+    """A network in training, and the average of its weights."""
 
     def __init__(
         self,
@@ -79,7 +80,8 @@ class Training:
             [{"params": net.pretrained_parameters(), "lr": 3e-4}, {"params": fresh, "lr": 1e-3}],
             weight_decay=2e-2,
         )
-        self.steps, self.step, self.seconds, self.device = steps, 0, 0.0, device
+        parts = {"net": self.net, "average": self.average, "optimiser": self.optimiser}
+        super().__init__(parts, steps, device)
         self.bfloat16 = bfloat16
         self.peaks = [rate * float(group["lr"]) for group in self.optimiser.param_groups]
 
@@ -98,27 +100,6 @@ class Training:
         self.step += 1
         average_into(self.average, self.net, min(0.995, self.step / (self.step + 10.0)))
         return loss.detach(), factor
-
-    def save(self, path: Path, settings: dict[str, object]) -> None:
-        """Write the checkpoint; a run that is killed meanwhile keeps the earlier one."""
-        state = {
-            "net": self.net.state_dict(), "average": self.average.state_dict(),
-            "optimiser": self.optimiser.state_dict(), "step": self.step, "seconds": self.seconds,
-            "settings": settings,
-        }  # fmt: skip
-        part = path.with_suffix(".part")
-        torch.save(state, part)
-        part.replace(path)
-
-    def restore(self, path: Path, settings: dict[str, object]) -> None:
-        """Go on from a checkpoint. Raises SystemExit when it was made with other settings."""
-        state = torch.load(path, map_location=self.device, weights_only=True)
-        if state["settings"] != settings:
-            raise SystemExit(f"{path}: was made with {state['settings']}; choose another --out, or remove it")
-        self.net.load_state_dict(state["net"])
-        self.average.load_state_dict(state["average"])
-        self.optimiser.load_state_dict(state["optimiser"])
-        self.step, self.seconds = state["step"], state["seconds"]
 
 
 def draw_curves(log: Path, picture: Path) -> None:
