@@ -11,8 +11,8 @@ import shapely
 from augment import augmented, coarse, colours, snow
 from buildloc_eval.places import Scene
 from crops import CROP_PX, ONE_HOUSE_M2, CropConfig, CropSampler, core
-from rendered import Canvas, rectangle
-from towns import block, decoys, render
+from layouts import block, decoys, render, street
+from rendered import Canvas, Light, rectangle
 
 PLAIN = CropConfig(rendered_share=0.0, decoy_share=0.0)
 
@@ -142,6 +142,28 @@ def test_houses_of_a_block_touch_and_do_not_overlap() -> None:
         others = outlines[:k] + outlines[k + 1 :]
         assert min(outline.distance(other) for other in others) < 1e-6
         assert max(outline.intersection(other).area for other in others) < 1e-6
+
+
+def test_houses_of_a_street_stand_on_both_sides_of_its_road() -> None:
+    canvas = Canvas(448, 0.2, np.random.default_rng(2))
+    plans = street(canvas, 0.4)
+    assert len(plans) > 6
+    across = np.sort([centre @ (-np.sin(0.4), np.cos(0.4)) for centre, *_ in plans])
+    assert np.diff(across).max() * 0.2 > 10.0  # the road and the gardens in front
+
+
+def test_tall_houses_shade_lower_roofs_and_not_higher_ones() -> None:
+    shaded = []
+    for height in (5.0, 500.0):
+        canvas = Canvas(64, 0.2, np.random.default_rng(1))
+        canvas.labels[:, 32:] = 1
+        canvas.roof_px[:, 32:] = height
+        before = canvas.rgb.copy()
+        for angle in np.linspace(0.0, 6.0, 7):
+            canvas.light = Light(np.array([np.cos(angle), np.sin(angle)]), 1.0, 0.5, np.zeros(2))
+            canvas.shade(rectangle(np.array([24.0, 32.0]), 8.0, 8.0, 0.0), 40.0)
+        shaded.append((canvas.rgb != before)[:, 32:].any())
+    assert shaded == [True, False]
 
 
 def test_a_batch_depends_on_seed_and_step_alone_so_that_a_run_resumes() -> None:

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from augment import augmented
 from buildloc_eval.places import Scene
+from layouts import decoys, render
 from numpy.typing import NDArray
 from rendered import Image, Labels
-from towns import decoys, render
 
 TRAIN_GSD_M = 0.2  # what the network sees
 FINEST_GSD_M = 0.12  # scenes are kept no finer than this

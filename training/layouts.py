@@ -123,6 +123,7 @@ def decoys(rgb: Image, labels: Labels, gsd_m: float, rng: np.random.Generator) -
     """A real picture with pavings, car parks and cars drawn on its ground: none of them is a building."""
     canvas = Canvas(len(rgb), gsd_m, rng)
     canvas.rgb, canvas.labels = rgb.copy(), labels
+    canvas.roof_px[labels > 0] = np.inf  # how high they are is not known: nothing shades them
     angle = rng.uniform(0.0, math.pi)
     for _ in range(rng.integers(1, 5)):
         drawers = (
