@@ -19,6 +19,12 @@ LabelImage = NDArray[np.int32]
 # cores, by distance where it does not.
 CORE_INSET_M = 0.6
 MIN_CORE_M2 = 1.0  # smaller ones are noise: a shed of 8 m2 has a core of 2.6 m2
+# A connected part of the mask that is larger than any house and far from the shape of one building is a block
+# of a dense town. There a valley in the score of cores tells houses apart even where it stays above 0.
+BLOCK_M2 = 500.0
+BLOCK_SOLIDITY = 0.7  # share of its convex hull that one building fills at least
+VALLEYS = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)  # logits
+MIN_PEAK_M2 = 4.0  # of both sides of a valley
 # The line between touching buildings on the wire. The mapper fuses at 0.25 m per pixel: anything narrower
 # than 0.25 m times the root of two, at a slant, would have gaps there.
 GAP_M = 0.4
@@ -72,7 +78,8 @@ def find_instances(
     """
     min_px = min_area_m2 / gsd_m**2
     mask = fill_holes((building > 0.0).view(np.uint8), min_px)
-    labels = _separated(mask, _cores(mask, core, gsd_m), MIN_CORE_M2 / gsd_m**2)
+    valleys = () if core is None else VALLEYS
+    labels = _separated(mask, _depth(mask, core, gsd_m), valleys, gsd_m)
     inside = mask.view(np.bool_)
     numbers = labels[inside]
     pixels = np.bincount(numbers, minlength=1)
@@ -84,12 +91,17 @@ def find_instances(
     return Instances(labels, building, _between(labels, max(1, round(0.5 * gap_m / gsd_m))), gsd_m)
 
 
-def _cores(mask: ByteArray, core: FloatImage | None, gsd_m: float) -> ByteArray:
-    if core is not None:
-        # What is finer than the inset that defines a core is noise: it would split large roofs.
-        smooth = cv2.GaussianBlur(core, (0, 0), CORE_INSET_M / gsd_m)
-        return np.asarray(mask & (smooth > 0.0), dtype=np.uint8)
-    return (cv2.distanceTransform(mask, cv2.DIST_L2, 3) * gsd_m > CORE_INSET_M).astype(np.uint8)
+def _depth(mask: ByteArray, core: FloatImage | None, gsd_m: float) -> FloatImage:
+    """(h, w) how deep in its own building a pixel lies: a logit where the network marks cores, where it does
+    not the distance to the edge, metres. Above 0 in cores, -inf outside of the mask."""
+    if core is None:
+        distance = cv2.distanceTransform(mask, cv2.DIST_L2, 3)
+        return np.where(
+            mask > 0, distance * np.float32(gsd_m) - np.float32(CORE_INSET_M), -np.float32(np.inf)
+        )
+    # What is finer than the inset that defines a core is noise: it would split large roofs.
+    smooth = cv2.GaussianBlur(core, (0, 0), CORE_INSET_M / gsd_m)
+    return np.where(mask > 0, smooth, -np.float32(np.inf))
 
 
 def _components(mask: ByteArray, connectivity: int) -> tuple[int, LabelImage]:
@@ -98,16 +110,20 @@ def _components(mask: ByteArray, connectivity: int) -> tuple[int, LabelImage]:
     return count, np.asarray(labels, dtype=np.int32)
 
 
-def _separated(mask: ByteArray, cores: ByteArray, min_core_px: float) -> LabelImage:
+def _separated(mask: ByteArray, depth: FloatImage, valleys: tuple[float, ...], gsd_m: float) -> LabelImage:
     """(h, w) 0 outside of the mask, inside a number above 0 for each building.
 
     Only where a connected part of the mask holds several cores has the watershed anything to decide.
     """
     parts, part = _components(mask, 8)
-    count, core = _components(cores, 4)
-    at = np.flatnonzero(cores.view(np.bool_))
+    count, core = _components((depth > 0.0).view(np.uint8), 4)
+    blocks = _blocks(part, parts, BLOCK_M2 / gsd_m**2)
+    if valleys and blocks.any():
+        in_blocks = np.where(np.take(blocks, part), depth, np.float32(0.0))
+        count, core = _parted(core, count, in_blocks, valleys, MIN_PEAK_M2 / gsd_m**2)
+    at = np.flatnonzero(core)
     numbers = core.ravel()[at]
-    large = np.bincount(numbers, minlength=count) >= min_core_px
+    large = np.bincount(numbers, minlength=count) >= MIN_CORE_M2 / gsd_m**2
     large[0] = False
     home = np.zeros(count, np.int32)
     home[numbers] = part.ravel()[at]  # all of a core lies in one part
@@ -118,6 +134,41 @@ def _separated(mask: ByteArray, cores: ByteArray, min_core_px: float) -> LabelIm
     seeds = np.zeros_like(part)
     seeds.ravel()[at] = np.where(large & shared[home], np.arange(count) + parts, 0).astype(np.int32)[numbers]
     return np.where(disputed > 0, _flooded(disputed, seeds), part)
+
+
+def _blocks(part: LabelImage, parts: int, min_px: float) -> NDArray[np.bool_]:
+    """(parts,) which parts are blocks of a dense town."""
+    pixels = np.bincount(part.ravel(), minlength=parts)
+    block = pixels >= min_px
+    block[0] = False
+    for number in np.flatnonzero(block):
+        hull = cv2.convexHull(cv2.findNonZero((part == number).view(np.uint8)))
+        block[number] = pixels[number] < BLOCK_SOLIDITY * max(cv2.contourArea(hull), 1.0)
+    return block
+
+
+def _parted(
+    core: LabelImage, count: int, depth: FloatImage, valleys: tuple[float, ...], min_px: float
+) -> tuple[int, LabelImage]:
+    """How many cores, the background among them, and the number of each pixel's, after each valley of
+    ``depth`` with enough on both sides has parted its core."""
+    core = core.copy()
+    for level in valleys:
+        pieces, piece = _components((depth > level).view(np.uint8), 4)
+        at = np.flatnonzero(piece)
+        numbers = piece.ravel()[at]
+        large = np.bincount(numbers, minlength=pieces) >= min_px
+        large[0] = False
+        home = np.zeros(pieces, np.int32)
+        home[numbers] = core.ravel()[at]  # all of a piece lies in one core, or in none that is left
+        several = np.bincount(home[large], minlength=count) > 1
+        several[0] = False
+        core[np.take(several, core)] = 0
+        core.ravel()[at] = np.where(
+            (large & several[home])[numbers], numbers + count, core.ravel()[at]
+        ).astype(np.int32)
+        count += pieces
+    return count, core
 
 
 def _flooded(mask: ByteArray, seeds: LabelImage) -> LabelImage:

@@ -70,6 +70,26 @@ def test_what_is_finer_than_the_inset_of_a_core_splits_nothing() -> None:
     assert len(found(scores((10, 10, 110, 70)), core)) == 1
 
 
+def valley(boxes: tuple[Box, ...], size: tuple[int, int]) -> np.ndarray:
+    """Cores of the boxes that the network is sure of, joined by what it is less sure of."""
+    low = scores(*boxes, inset=-3, size=size)
+    return np.where(scores(*boxes, inset=3, size=size) > 0.0, low, np.minimum(low, 1.5)).astype(np.float32)
+
+
+def houses(*cells: tuple[int, int]) -> tuple[Box, ...]:
+    """Houses of 12 x 12 m at the cells of a grid, column and row."""
+    return tuple((10 + 60 * i, 10 + 60 * k, 70 + 60 * i, 70 + 60 * k) for i, k in cells)
+
+
+def test_in_a_block_of_a_dense_town_a_valley_between_cores_is_enough() -> None:
+    street = houses((0, 0), (1, 0), (2, 0), (3, 0), (0, 1), (0, 2), (0, 3))  # and another one around a corner
+    hall = houses(*((i, k) for i in range(4) for k in range(2)))
+    few = street[:3]
+    size = (260, 260)
+    counts = [len(found(scores(*at, size=size), valley(at, size))) for at in (street, hall, few)]
+    assert counts == [7, 1, 1]
+
+
 @pytest.mark.parametrize(("zoom", "gap_m"), [(2.0, 0.4), (1.0, 0.4), (0.4, 0.75)])
 def test_the_mask_keeps_touching_buildings_apart_at_any_size(zoom: float, gap_m: float) -> None:
     pixel_m = GSD_M / zoom
