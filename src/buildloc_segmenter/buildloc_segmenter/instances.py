@@ -92,16 +92,13 @@ def find_instances(
 
 
 def _depth(mask: ByteArray, core: FloatImage | None, gsd_m: float) -> FloatImage:
-    """(h, w) how deep in its own building a pixel lies: a logit where the network marks cores, where it does
-    not the distance to the edge, metres. Above 0 in cores, -inf outside of the mask."""
+    """(h, w) how deep in its own building a pixel of the mask lies, above 0 in cores: a logit where the
+    network marks cores, metres to the edge where it does not."""
     if core is None:
         distance = cv2.distanceTransform(mask, cv2.DIST_L2, 3)
-        return np.where(
-            mask > 0, distance * np.float32(gsd_m) - np.float32(CORE_INSET_M), -np.float32(np.inf)
-        )
+        return np.asarray(distance * np.float32(gsd_m) - np.float32(CORE_INSET_M), dtype=np.float32)
     # What is finer than the inset that defines a core is noise: it would split large roofs.
-    smooth = cv2.GaussianBlur(core, (0, 0), CORE_INSET_M / gsd_m)
-    return np.where(mask > 0, smooth, -np.float32(np.inf))
+    return np.asarray(cv2.GaussianBlur(core, (0, 0), CORE_INSET_M / gsd_m), dtype=np.float32)
 
 
 def _components(mask: ByteArray, connectivity: int) -> tuple[int, LabelImage]:
@@ -115,12 +112,13 @@ def _separated(mask: ByteArray, depth: FloatImage, valleys: tuple[float, ...], g
 
     Only where a connected part of the mask holds several cores has the watershed anything to decide.
     """
-    parts, part = _components(mask, 8)
-    count, core = _components((depth > 0.0).view(np.uint8), 4)
-    blocks = _blocks(part, parts, BLOCK_M2 / gsd_m**2)
-    if valleys and blocks.any():
-        in_blocks = np.where(np.take(blocks, part), depth, np.float32(0.0))
-        count, core = _parted(core, count, in_blocks, valleys, MIN_PEAK_M2 / gsd_m**2)
+    parts, *found = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    part, stats = (np.asarray(each, dtype=np.int32) for each in found[:2])
+    count, core = _components(mask & (depth > 0.0).view(np.uint8), 4)
+    for number in _blocks(part, stats, BLOCK_M2 / gsd_m**2) if valleys else ():
+        window = _window(stats[number])
+        inside = np.where(part[window] == number, depth[window], np.float32(0.0))
+        count, core[window] = _parted(core[window], count, inside, valleys, MIN_PEAK_M2 / gsd_m**2)
     at = np.flatnonzero(core)
     numbers = core.ravel()[at]
     large = np.bincount(numbers, minlength=count) >= MIN_CORE_M2 / gsd_m**2
@@ -136,15 +134,22 @@ def _separated(mask: ByteArray, depth: FloatImage, valleys: tuple[float, ...], g
     return np.where(disputed > 0, _flooded(disputed, seeds), part)
 
 
-def _blocks(part: LabelImage, parts: int, min_px: float) -> NDArray[np.bool_]:
-    """(parts,) which parts are blocks of a dense town."""
-    pixels = np.bincount(part.ravel(), minlength=parts)
-    block = pixels >= min_px
-    block[0] = False
-    for number in np.flatnonzero(block):
-        hull = cv2.convexHull(cv2.findNonZero((part == number).view(np.uint8)))
-        block[number] = pixels[number] < BLOCK_SOLIDITY * max(cv2.contourArea(hull), 1.0)
-    return block
+def _window(stats: NDArray[np.int32]) -> tuple[slice, slice]:
+    """Rows and columns of a connected part, by OpenCV's statistics of it."""
+    left, top, width, height, _ = stats
+    return slice(top, top + height), slice(left, left + width)
+
+
+def _blocks(part: LabelImage, stats: NDArray[np.int32], min_px: float) -> list[int]:
+    """Numbers of the parts that are blocks of a dense town; ``stats`` (parts, 5) are OpenCV's of them."""
+    pixels = stats[:, cv2.CC_STAT_AREA]
+    found = []
+    for number in range(1, len(stats)):
+        if pixels[number] >= min_px:
+            hull = cv2.convexHull(cv2.findNonZero((part[_window(stats[number])] == number).view(np.uint8)))
+            if pixels[number] < BLOCK_SOLIDITY * cv2.contourArea(hull):
+                found.append(number)
+    return found
 
 
 def _parted(
