@@ -116,6 +116,11 @@ class Light:
         away = np.array([math.cos(angle), math.sin(angle)])
         return Light(away, rng.uniform(0.3, 1.8), shade, rng.normal(0.0, 0.12, 2))
 
+    def shadow(self, outline: Points, height_px: float) -> Points:
+        """The outline of a body together with its shadow."""
+        tip = outline + self.away * height_px * self.stretch
+        return cv2.convexHull(np.vstack([outline, tip]).astype(np.float32))[:, 0].astype(np.float64)
+
 
 class Canvas:
     """A picture under construction: RGB, and the building of each pixel."""
@@ -151,9 +156,8 @@ class Canvas:
         that it reaches."""
         low = self.roof_px < 0.6 * height_px
         for reach, lit in ((1.0, self.labels == 0), (0.5, (self.labels > 0) & low)):
-            tip = outline + self.light.away * height_px * self.light.stretch * reach
-            hull = cv2.convexHull(np.vstack([outline, tip]).astype(np.float32))[:, 0].astype(np.float64)
-            self.rgb[_where(_inside(self.labels.shape, hull), lit)] *= self.light.shade
+            shadow = self.light.shadow(outline, height_px * reach)
+            self.rgb[_where(_inside(self.labels.shape, shadow), lit)] *= self.light.shade
 
     def car(self, centre: Points, angle: float) -> None:
         """A parked car."""
@@ -299,12 +303,13 @@ def _roof_faces(length: float, width: float, kind: str) -> list[tuple[Points, Po
     return faces
 
 
-def _roof_top(canvas: Canvas, footprint: NDArray[np.bool_], outline: Points, colour: Image) -> None:
+def _roof_top(
+    canvas: Canvas, footprint: NDArray[np.bool_], wing: tuple[Points, float, float, float], colour: Image
+) -> None:
     """What stands on a flat roof that people use: parapet, head of the stairs, water tanks."""
-    rng, centre = canvas.rng, outline.mean(axis=0)
-    size = float(np.linalg.norm(outline[0] - outline[1])), float(np.linalg.norm(outline[1] - outline[2]))
-    angle = float(np.arctan2(*(outline[0] - outline[1])[::-1]))
-    inner = rectangle(centre, *(max(1.0, side - 2.0 * canvas.px(0.2, 0.5)) for side in size), angle)
+    rng, (centre, length, width, angle) = canvas.rng, wing
+    size = (max(1.0, side - 2.0 * canvas.px(0.2, 0.5)) for side in (length, width))
+    inner = rectangle(centre, *size, angle)
     floor = colour * np.float32(rng.uniform(0.65, 1.0)) if rng.random() < 0.6 else canvas.paving()
     where = _where(_inside(footprint.shape, inner), footprint)
     canvas.rgb[where] = floor + canvas.fine[where] * np.float32(rng.uniform(2.0, 9.0))
@@ -320,9 +325,8 @@ def _roof_top(canvas: Canvas, footprint: NDArray[np.bool_], outline: Points, col
         else:
             body, height = spot + disc * canvas.px(0.4, 0.9), canvas.px(0.8, 1.8)
             paint = np.full(3, tank, dtype=np.float32)
-        tip = body + canvas.light.away * height * canvas.light.stretch
-        hull = cv2.convexHull(np.vstack([body, tip]).astype(np.float32))[:, 0].astype(np.float64)
-        canvas.rgb[_where(_inside(footprint.shape, hull), footprint)] *= canvas.light.shade
+        shadow = canvas.light.shadow(body, height)
+        canvas.rgb[_where(_inside(footprint.shape, shadow), footprint)] *= canvas.light.shade
         canvas.rgb[_where(_inside(footprint.shape, body), footprint)] = paint
 
 
@@ -378,7 +382,7 @@ def building(canvas: Canvas, number: int, centre: Points, length: float, width: 
             ribs = 1.0 + amplitude * np.sin(along * (math.tau / max(stripes, 2.2)))
             canvas.rgb[where] = colour * lit * ribs[:, None] + canvas.fine[where] * rng.uniform(1.0, 8.0)
         if kind == "flat" and used:
-            _roof_top(canvas, footprint, rectangle(at, long, wide, a), colour)
+            _roof_top(canvas, footprint, (at, long, wide, a), colour)
     canvas.labels[footprint] = number
     canvas.roof_px[footprint] = height
     for _ in range(rng.integers(0, 5)):  # chimneys, skylights, panels
