@@ -5,6 +5,7 @@ Everything here is at the network's ground sampling distance; a score is a logit
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -39,12 +40,14 @@ class Instances:
     """The buildings of an image.
 
     ``labels`` (h, w) int32: 0 ground, 1 to N the buildings. ``building`` (h, w) float32: the score of each
-    pixel, above 0 where the network saw a building. ``between`` (h, w) bool: the line between touching
-    buildings, which a mask leaves out. ``gsd_m`` metres per pixel.
+    pixel, above 0 where the network saw a building. ``scores`` (N,) float32: the mean core probability of
+    each building, building probability where the network marks no cores. ``between`` (h, w) bool: the line
+    between touching buildings, which a mask leaves out. ``gsd_m`` metres per pixel.
     """
 
     labels: LabelImage
     building: FloatImage
+    scores: FloatImage
     between: NDArray[np.bool_]
     gsd_m: float
 
@@ -73,8 +76,9 @@ def find_instances(
 
     A core is what lies well inside one building; touching roofs have separate ones. Each grows in its
     connected part of the mask until it meets the next. A part without a core is one building. Holes and
-    buildings below ``min_area_m2`` are removed, and buildings whose pixels have a mean probability below
-    ``min_score``. ``image_gsd_m`` is that of the image the mask is for.
+    buildings below ``min_area_m2`` are removed, and buildings that score below ``min_score``: the mean core
+    probability of their pixels. The small ones have to be surer, as less of them is core. Without ``core`` it
+    is the building probability. ``image_gsd_m`` is that of the image the mask is for.
     """
     min_px = min_area_m2 / gsd_m**2
     mask = fill_holes((building > 0.0).view(np.uint8), min_px)
@@ -83,12 +87,14 @@ def find_instances(
     inside = mask.view(np.bool_)
     numbers = labels[inside]
     pixels = np.bincount(numbers, minlength=1)
-    score = np.bincount(numbers, probability(building[inside]), len(pixels)) / np.maximum(pixels, 1)
+    sure = probability((building if core is None else core)[inside])
+    score = np.bincount(numbers, sure, len(pixels)) / np.maximum(pixels, 1)
     kept = (pixels >= max(min_px, 1.0)) & (score >= min_score)
     kept[0] = False
     labels[inside] = np.where(kept, np.cumsum(kept), 0).astype(np.int32)[numbers]
     gap_m = max(GAP_M, GAP_PX * image_gsd_m)
-    return Instances(labels, building, _between(labels, max(1, round(0.5 * gap_m / gsd_m))), gsd_m)
+    between = _between(labels, max(1, round(0.5 * gap_m / gsd_m)))
+    return Instances(labels, building, score[kept].astype(np.float32), between, gsd_m)
 
 
 def _depth(mask: ByteArray, core: FloatImage | None, gsd_m: float) -> FloatImage:
@@ -112,11 +118,9 @@ def _separated(mask: ByteArray, depth: FloatImage, valleys: tuple[float, ...], g
 
     Only where a connected part of the mask holds several cores has the watershed anything to decide.
     """
-    parts, *found = cv2.connectedComponentsWithStats(mask, connectivity=8)
-    part, stats = (np.asarray(each, dtype=np.int32) for each in found[:2])
+    parts, part = _components(mask, 8)
     count, core = _components(mask & (depth > 0.0).view(np.uint8), 4)
-    for number in _blocks(part, stats, BLOCK_M2 / gsd_m**2) if valleys else ():
-        window = _window(stats[number])
+    for number, window in _blocks(part, mask, BLOCK_M2 / gsd_m**2) if valleys else ():
         inside = np.where(part[window] == number, depth[window], np.float32(0.0))
         count, core[window] = _parted(core[window], count, inside, valleys, MIN_PEAK_M2 / gsd_m**2)
     at = np.flatnonzero(core)
@@ -134,22 +138,14 @@ def _separated(mask: ByteArray, depth: FloatImage, valleys: tuple[float, ...], g
     return np.where(disputed > 0, _flooded(disputed, seeds), part)
 
 
-def _window(stats: NDArray[np.int32]) -> tuple[slice, slice]:
-    """Rows and columns of a connected part, by OpenCV's statistics of it."""
-    left, top, width, height, _ = stats
-    return slice(top, top + height), slice(left, left + width)
-
-
-def _blocks(part: LabelImage, stats: NDArray[np.int32], min_px: float) -> list[int]:
-    """Numbers of the parts that are blocks of a dense town; ``stats`` (parts, 5) are OpenCV's of them."""
-    pixels = stats[:, cv2.CC_STAT_AREA]
-    found = []
-    for number in range(1, len(stats)):
-        if pixels[number] >= min_px:
-            hull = cv2.convexHull(cv2.findNonZero((part[_window(stats[number])] == number).view(np.uint8)))
-            if pixels[number] < BLOCK_SOLIDITY * cv2.contourArea(hull):
-                found.append(number)
-    return found
+def _blocks(part: LabelImage, mask: ByteArray, min_px: float) -> Iterator[tuple[int, tuple[slice, slice]]]:
+    """The parts of a mask that are blocks of a dense town: number, rows and columns of each."""
+    pixels = np.bincount(part[mask.view(np.bool_)])
+    for number in np.flatnonzero(pixels >= min_px):
+        points = cv2.findNonZero((part == number).view(np.uint8))
+        if pixels[number] < BLOCK_SOLIDITY * cv2.contourArea(cv2.convexHull(points)):
+            left, top, width, height = cv2.boundingRect(points)
+            yield int(number), (slice(top, top + height), slice(left, left + width))
 
 
 def _parted(

@@ -15,7 +15,7 @@ from shapely.affinity import affine_transform, translate
 from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 
-from buildloc_segmenter.instances import Instances, probability
+from buildloc_segmenter.instances import Instances
 
 FINER = 4  # outlines are traced on a raster so much finer than the labels
 SIMPLIFY_M = 0.5  # how far an outline may lie from the traced one
@@ -29,7 +29,7 @@ class Building:
     """A building of an image.
 
     ``outline`` in pixels of the image, x right, y down, (0, 0) the outer corner of the first pixel;
-    courtyards are filled. ``area_m2`` that of the outline. ``score`` mean building probability inside.
+    courtyards are filled. ``area_m2`` that of the outline. ``score`` as Instances.scores.
     """
 
     outline: Polygon
@@ -56,7 +56,6 @@ def buildings(instances: Instances, pixel_m: float) -> list[Building]:
     scale = instances.gsd_m / pixel_m
     # A pixel of ground all around: outlines end at the image's edge, and every window can take one more.
     margin, labels = np.pad(instances.margin(), 1, mode="edge"), np.pad(instances.labels, 1)
-    building = np.pad(instances.building, 1)
     found = []
     for number, box in enumerate(ndimage.find_objects(labels), start=1):
         if box is None:
@@ -68,7 +67,7 @@ def buildings(instances: Instances, pixel_m: float) -> list[Building]:
         if outline is None:
             continue
         placed = affine_transform(outline, [scale, 0.0, 0.0, scale, (left - 1) * scale, (top - 1) * scale])
-        score = float(np.mean(probability(building[window][inside])))
+        score = float(instances.scores[number - 1])
         found.append(Building(placed, placed.area * pixel_m**2, score))
     return found
 

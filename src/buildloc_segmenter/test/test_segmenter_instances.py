@@ -21,7 +21,7 @@ def scores(*boxes: Box, inset: int = 0, size: tuple[int, int] = (80, 120)) -> np
 
 
 def found(
-    building: np.ndarray, core: np.ndarray | None = None, min_area_m2: float = 8.0, min_score: float = 0.5
+    building: np.ndarray, core: np.ndarray | None = None, min_area_m2: float = 8.0, min_score: float = 0.0
 ) -> Instances:
     return find_instances(building, core, GSD_M, min_area_m2, min_score, image_gsd_m=0.1)
 
@@ -93,7 +93,7 @@ def test_in_a_block_of_a_dense_town_a_valley_between_cores_is_enough() -> None:
 @pytest.mark.parametrize(("zoom", "gap_m"), [(2.0, 0.4), (1.0, 0.4), (0.4, 0.75)])
 def test_the_mask_keeps_touching_buildings_apart_at_any_size(zoom: float, gap_m: float) -> None:
     pixel_m = GSD_M / zoom
-    instances = find_instances(scores(*TERRACE), scores(*TERRACE, inset=3), GSD_M, 8.0, 0.5, pixel_m)
+    instances = find_instances(scores(*TERRACE), scores(*TERRACE, inset=3), GSD_M, 8.0, 0.0, pixel_m)
     height, width = (round(side * zoom) for side in instances.labels.shape)
     mask = draw_mask(instances, (width, height))
     assert mask.shape == (height, width) and set(np.unique(mask)) == {0, 255}
@@ -125,17 +125,26 @@ def test_small_buildings_and_holes_go_and_the_numbers_stay_without_gaps() -> Non
 
 
 def test_a_building_that_the_network_doubts_goes_and_its_neighbour_stays() -> None:
-    image = scores((10, 10, 40, 40), (40, 10, 70, 40), (80, 10, 110, 40))
-    image[10:40, 40:70] = 1.0  # a probability of 0.73: a terrace at the house
-    image[10:40, 80:110] = 1.0  # and a shed of which half is sure: 0.86
-    image[10:40, 95:110] = 5.0
-    core = np.where(scores((10, 10, 40, 40), inset=3) > scores((40, 10, 70, 40), inset=3), 5.0, -5.0)
-    core[13:37, 43:67] = core[13:37, 83:107] = 5.0
-    for min_score, numbers in ((0.7, {0, 1, 2, 3}), (0.75, {0, 1, 2}), (0.9, {0, 1})):
-        instances = found(image, core.astype(np.float32), min_score=min_score)
-        assert set(np.unique(instances.labels)) == numbers and instances.labels[25, 25] > 0
-    assert instances.labels[25, 55] == 0 and not instances.between.any()
-    assert parts(draw_mask(instances, (120, 80))) == 1
+    house, terrace, shed = (10, 10, 40, 40), (40, 10, 70, 40), (80, 10, 95, 25)
+    image = scores(house, terrace, shed)
+    core = np.full(image.shape, -5.0, dtype=np.float32)
+    # Of the house 0.64 is core, as sure as the network gets; of a shed that it is as sure of 0.36.
+    core[13:37, 13:37] = core[13:22, 83:92] = 5.0
+    core[13:37, 43:67] = 0.5  # a terrace at the house: of 0.64, a probability of 0.62
+    for min_score, numbers in ((0.3, {0, 1, 2, 3}), (0.38, {0, 1, 2}), (0.5, {0, 1}), (0.7, {0})):
+        instances = found(image, core, min_score=min_score)
+        assert set(np.unique(instances.labels)) == numbers and len(instances.scores) == len(instances)
+        assert (instances.scores >= min_score).all()
+    kept = found(image, core, min_score=0.5)
+    assert kept.labels[25, 25] == 1 and kept.labels[25, 55] == 0 and not kept.between.any()
+    assert parts(draw_mask(kept, (120, 80))) == 1
+    assert kept.scores == pytest.approx([(1.0 / (1.0 + np.exp(-core)))[kept.labels == 1].mean()])
+
+
+def test_without_cores_it_is_the_building_probability_that_scores() -> None:
+    image = scores((10, 10, 40, 40), (60, 10, 90, 40))
+    image[10:40, 60:90] = 1.0  # a probability of 0.73
+    assert [len(found(image, min_score=least)) for least in (0.7, 0.75)] == [2, 1]
 
 
 def test_only_enclosed_background_is_a_hole() -> None:

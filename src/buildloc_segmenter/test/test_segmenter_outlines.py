@@ -109,7 +109,7 @@ def test_touching_roofs_have_one_outline_each_and_share_a_wall() -> None:
     assert all(max(iou(outline, true) for outline in found) > 0.95 for true in (left, right))
 
 
-def test_the_score_is_the_mean_probability() -> None:
+def test_without_cores_the_score_is_the_mean_probability() -> None:
     sure, unsure = (traced_score(logit) for logit in (4.0, 0.5))
     assert sure == pytest.approx(1 / (1 + math.exp(-4.0)), abs=0.01)
     assert unsure == pytest.approx(1 / (1 + math.exp(-0.5)), abs=0.01)
