@@ -123,19 +123,32 @@ def _separated(mask: ByteArray, depth: FloatImage, valleys: tuple[float, ...], g
     for number, window in _blocks(part, mask, BLOCK_M2 / gsd_m**2) if valleys else ():
         inside = np.where(part[window] == number, depth[window], np.float32(0.0))
         count, core[window] = _parted(core[window], count, inside, valleys, MIN_PEAK_M2 / gsd_m**2)
-    at = np.flatnonzero(core)
-    numbers = core.ravel()[at]
-    large = np.bincount(numbers, minlength=count) >= MIN_CORE_M2 / gsd_m**2
-    large[0] = False
-    home = np.zeros(count, np.int32)
-    home[numbers] = part.ravel()[at]  # all of a core lies in one part
-    shared = np.bincount(home[large], minlength=parts) > 1
+    at, seed, shared = _dividing(core, count, part, parts, MIN_CORE_M2 / gsd_m**2)
     if not shared.any():
         return part
     disputed = np.take(shared, part).view(np.uint8)
     seeds = np.zeros_like(part)
-    seeds.ravel()[at] = np.where(large & shared[home], np.arange(count) + parts, 0).astype(np.int32)[numbers]
+    seeds.ravel()[at] = np.where(seed > 0, seed + parts, 0)
     return np.where(disputed > 0, _flooded(disputed, seeds), part)
+
+
+def _dividing(
+    piece: LabelImage, pieces: int, whole: LabelImage, wholes: int, min_px: float
+) -> tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.bool_]]:
+    """Pixels of all pieces (K,); at each the number of its piece where that is of at least ``min_px`` and not
+    the only such one of its whole, else 0; and whether each whole, by number, holds several of them.
+
+    All of a piece lies in one whole, or in none.
+    """
+    at = np.flatnonzero(piece)
+    numbers = piece.ravel()[at]
+    large = np.bincount(numbers, minlength=pieces) >= min_px
+    large[0] = False
+    home = np.zeros(pieces, np.int32)
+    home[numbers] = whole.ravel()[at]
+    several = np.bincount(home[large], minlength=wholes) > 1
+    several[0] = False
+    return at, np.where(large & several[home], np.arange(pieces), 0).astype(np.int32)[numbers], several
 
 
 def _blocks(part: LabelImage, mask: ByteArray, min_px: float) -> Iterator[tuple[int, tuple[slice, slice]]]:
@@ -156,18 +169,9 @@ def _parted(
     core = core.copy()
     for level in valleys:
         pieces, piece = _components((depth > level).view(np.uint8), 4)
-        at = np.flatnonzero(piece)
-        numbers = piece.ravel()[at]
-        large = np.bincount(numbers, minlength=pieces) >= min_px
-        large[0] = False
-        home = np.zeros(pieces, np.int32)
-        home[numbers] = core.ravel()[at]  # all of a piece lies in one core, or in none that is left
-        several = np.bincount(home[large], minlength=count) > 1
-        several[0] = False
+        at, seed, several = _dividing(piece, pieces, core, count, min_px)
         core[np.take(several, core)] = 0
-        core.ravel()[at] = np.where(
-            (large & several[home])[numbers], numbers + count, core.ravel()[at]
-        ).astype(np.int32)
+        core.ravel()[at] = np.where(seed > 0, seed + count, core.ravel()[at])
         count += pieces
     return count, core
 
