@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import multiprocessing
 from collections.abc import Callable
-from multiprocessing.queues import Queue
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
-
-DEADLINE_S = 600.0
 
 
 def memory_mb(what: str) -> float:
@@ -18,16 +16,14 @@ def memory_mb(what: str) -> float:
 
 
 def peak_mb(work: Callable[..., None], *args: Any) -> float:
-    """Peak resident memory, MB, libraries too, of a process that does ``work``, a function of a module."""
-    context = multiprocessing.get_context("spawn")
-    answer: Queue[float] = context.Queue()
-    process = context.Process(target=_work, args=(work, args, answer))
-    process.start()
-    peak = answer.get(timeout=DEADLINE_S)
-    process.join()
-    return peak
+    """Peak resident memory, MB, libraries too, of a process that does ``work``, a function of a module.
+
+    What ``work`` raises is raised here; BrokenProcessPool when its process ended without a word.
+    """
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(_work, work, args).result()
 
 
-def _work(work: Callable[..., None], args: tuple[Any, ...], answer: Queue[float]) -> None:
+def _work(work: Callable[..., None], args: tuple[Any, ...]) -> float:
     work(*args)
-    answer.put(memory_mb("VmHWM"))
+    return memory_mb("VmHWM")
