@@ -12,7 +12,7 @@ from augment import augmented, coarse, colours, snow
 from buildloc_eval.places import Scene
 from crops import CROP_PX, ONE_HOUSE_M2, CropConfig, CropSampler, core
 from layouts import block, decoys, render, street
-from rendered import Canvas, Light, rectangle
+from rendered import Canvas, Light, building, rectangle
 
 PLAIN = CropConfig(rendered_share=0.0, decoy_share=0.0)
 
@@ -150,6 +150,19 @@ def test_houses_of_a_street_stand_on_both_sides_of_its_road() -> None:
     assert len(plans) > 6
     across = np.sort([centre @ (-np.sin(0.4), np.cos(0.4)) for centre, *_ in plans])
     assert np.diff(across).max() * 0.2 > 10.0  # the road and the gardens in front
+
+
+def test_what_is_built_against_a_house_is_part_of_it_and_lower() -> None:
+    several = 0
+    for seed in range(40):
+        canvas = Canvas(200, 0.2, np.random.default_rng(seed))
+        assert building(canvas, 1, np.array([100.0, 100.0]), 60.0, 45.0, 0.3)
+        assert cv2.connectedComponents(canvas.labels.astype(np.uint8))[0] - 1 == 1
+        heights = np.unique(canvas.roof_px[canvas.labels == 1]) * 0.2
+        several += len(heights) > 1
+        assert (heights[:-1] < 3.4).all() or heights.max() < 3.4
+        assert canvas.roof_px[100, 100] * 0.2 in heights and not canvas.roof_px[canvas.labels == 0].any()
+    assert 5 < several < 30
 
 
 def test_tall_houses_shade_lower_roofs_and_not_higher_ones() -> None:

@@ -31,7 +31,7 @@ class CropConfig:
     rendered_share: float = 0.4
     rendered_scenes: int = 1200
     decoy_share: float = 0.3
-    scale: float = 1.6
+    scale: float = 1.5
     tilt: float = 0.06
     closing: float = 0.3
     closing_strength: float = 0.4

@@ -6,12 +6,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from rendered import GROUNDS, Canvas, Image, Labels, Points, annexes, building, rectangle
-
-Plan = tuple[Points, float, float, float]  # centre, length, width, angle of a house
+from rendered import GROUNDS, Canvas, Image, Labels, Wing, annexes, building, rectangle
 
 
-def block(canvas: Canvas, angle: float) -> list[Plan]:
+def block(canvas: Canvas, angle: float) -> list[Wing]:
     """A block of a dense town: two rows of houses that touch, back to back. Centre, length, width, angle."""
     rng = canvas.rng
     along = np.array([math.cos(angle), math.sin(angle)])
@@ -27,12 +25,12 @@ def block(canvas: Canvas, angle: float) -> list[Plan]:
     return plans
 
 
-def street(canvas: Canvas, angle: float) -> list[Plan]:
+def street(canvas: Canvas, angle: float) -> list[Wing]:
     """A street of detached houses, each on a plot with a garden, a drive, and often a garage and a shed."""
     rng = canvas.rng
     along = np.array([math.cos(angle), math.sin(angle)])
     across = np.array([-along[1], along[0]])
-    middle, plans = canvas.place(), list[Plan]()
+    middle, plans = canvas.place(), list[Wing]()
     canvas.road(middle, angle)
     setback = canvas.px(5.0, 12.0)
     house = (canvas.px(9.0, 15.0), canvas.px(7.0, 10.0))  # a street's houses are alike

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 Image = NDArray[np.float32]  # (H, W, 3) RGB, 0-255
 Labels = NDArray[np.int32]
 Points = NDArray[np.float64]
+Wing = tuple[Points, float, float, float]  # centre, length, width, angle of a rectangle
 
 GROUNDS = np.array(
     [
@@ -303,9 +304,7 @@ def _roof_faces(length: float, width: float, kind: str) -> list[tuple[Points, Po
     return faces
 
 
-def _roof_top(
-    canvas: Canvas, footprint: NDArray[np.bool_], wing: tuple[Points, float, float, float], colour: Image
-) -> None:
+def _roof_top(canvas: Canvas, footprint: NDArray[np.bool_], wing: Wing, colour: Image) -> None:
     """What stands on a flat roof that people use: parapet, head of the stairs, water tanks."""
     rng, (centre, length, width, angle) = canvas.rng, wing
     size = (max(1.0, side - 2.0 * canvas.px(0.2, 0.5)) for side in (length, width))
@@ -337,8 +336,60 @@ def _roof_colour(rng: np.random.Generator) -> Image:
     )
 
 
+def _body(
+    canvas: Canvas, number: int, footprint: NDArray[np.bool_], wings: list[Wing], height: float, kind: str,
+    colour: Image,
+) -> None:  # fmt: skip
+    """Draw wings of one height and kind of roof, and their shadow; theirs is the ``footprint``."""
+    rng = canvas.rng
+    wall = canvas.paving() * rng.uniform(0.8, 1.6)
+    for wing in wings:
+        canvas.shade(rectangle(*wing), height)
+    for wing in wings:  # the roof hides the foot of one wall, and shows that of the other
+        foot = rectangle(*wing)
+        hull = cv2.convexHull(np.vstack([foot, foot + canvas.light.lean * height]).astype(np.float32))[:, 0]
+        canvas.paint(hull.astype(np.float64), wall, 4.0)
+    stripes, amplitude = rng.uniform(0.25, 1.2) / canvas.gsd, rng.uniform(0.0, 0.12)
+    contrast = rng.uniform(0.2, 1.2) * (1.0 - canvas.light.shade)
+    used = rng.random() < 0.6
+    for at, long, wide, a in wings:
+        if rng.random() < 0.25:
+            colour = _roof_colour(rng)
+        t = np.array([[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]])
+        for face, downhill in _roof_faces(long, wide, kind):
+            rows, columns = where = _where(_inside(footprint.shape, at + face @ t.T), footprint)
+            lit = max(0.3, 1.0 - contrast * float((t @ downhill) @ canvas.light.away))
+            along = columns * math.cos(a) + rows * math.sin(a)
+            ribs = 1.0 + amplitude * np.sin(along * (math.tau / max(stripes, 2.2)))
+            canvas.rgb[where] = colour * lit * ribs[:, None] + canvas.fine[where] * rng.uniform(1.0, 8.0)
+        if kind == "flat" and used:
+            _roof_top(canvas, footprint, (at, long, wide, a), colour)
+    canvas.labels[footprint] = number
+    canvas.roof_px[footprint] = height
+
+
+def _attached(canvas: Canvas, number: int, house: Wing, free: NDArray[np.bool_], colour: Image) -> None:
+    """Draw what is built against a house and is part of it, lower and under a roof of its own: a garage, a
+    porch, a later part; where it is ``free``."""
+    rng, (centre, length, width, angle) = canvas.rng, house
+    long, wide = canvas.px(2.5, 7.5), canvas.px(2.5, 6.5)
+    if rng.random() < 0.5:
+        offset = np.array([(length + long) / 2.0, rng.uniform(-0.5, 0.5) * width])
+    else:
+        offset = np.array([rng.uniform(-0.5, 0.5) * length, (width + wide) / 2.0])
+    c, s = math.cos(angle), math.sin(angle)
+    at = centre + np.array([[c, -s], [s, c]]) @ (offset * rng.choice((-1.0, 1.0), 2))
+    wing = (at, long, wide, angle)
+    footprint = np.zeros(free.shape, dtype=np.bool_)
+    footprint[_where(_inside(free.shape, rectangle(*wing)), free)] = True
+    kind = str(rng.choice(("flat", "shed", "gable"), p=(0.5, 0.2, 0.3)))
+    own = colour if rng.random() < 0.3 else _roof_colour(rng)
+    _body(canvas, number, footprint, [wing], canvas.px(2.2, 3.4), kind, own)
+
+
 def building(canvas: Canvas, number: int, centre: Points, length: float, width: float, angle: float) -> bool:
-    """Draw one building of one or two wings with its shadow; False where another stands."""
+    """Draw one building, of a wing or two and at times something lower built against them, with its shadow;
+    False where another stands."""
     rng = canvas.rng
     turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     wings = [(centre, length, width, angle)]
@@ -359,32 +410,11 @@ def building(canvas: Canvas, number: int, centre: Points, length: float, width: 
     if not footprint.any() or taken[footprint].mean() > 0.1:  # pixels that touching houses share
         return False
     footprint &= ~taken
-    height = rng.uniform(2.5, 9.0) / canvas.gsd
-    wall = canvas.paving() * rng.uniform(0.8, 1.6)
-    for wing in wings:
-        canvas.shade(rectangle(*wing), height)
-    for wing in wings:  # the roof hides the foot of one wall, and shows that of the other
-        foot = rectangle(*wing)
-        hull = cv2.convexHull(np.vstack([foot, foot + canvas.light.lean * height]).astype(np.float32))[:, 0]
-        canvas.paint(hull.astype(np.float64), wall, 4.0)
+    height, colour = canvas.px(2.5, 9.0), _roof_colour(rng)
+    for _ in range(rng.integers(1, 3) if rng.random() < 0.35 else 0):  # first: the house shades it
+        _attached(canvas, number, wings[0], ~(taken | footprint), colour)
     kind = str(rng.choice(("gable", "hip", "flat", "shed"), p=(0.45, 0.2, 0.25, 0.1)))
-    stripes, amplitude = rng.uniform(0.25, 1.2) / canvas.gsd, rng.uniform(0.0, 0.12)
-    contrast = rng.uniform(0.2, 1.2) * (1.0 - canvas.light.shade)
-    colour, used = _roof_colour(rng), rng.random() < 0.6
-    for at, long, wide, a in wings:
-        if rng.random() < 0.25:
-            colour = _roof_colour(rng)
-        t = np.array([[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]])
-        for face, downhill in _roof_faces(long, wide, kind):
-            rows, columns = where = _where(_inside(footprint.shape, at + face @ t.T), footprint)
-            lit = max(0.3, 1.0 - contrast * float((t @ downhill) @ canvas.light.away))
-            along = columns * math.cos(a) + rows * math.sin(a)
-            ribs = 1.0 + amplitude * np.sin(along * (math.tau / max(stripes, 2.2)))
-            canvas.rgb[where] = colour * lit * ribs[:, None] + canvas.fine[where] * rng.uniform(1.0, 8.0)
-        if kind == "flat" and used:
-            _roof_top(canvas, footprint, (at, long, wide, a), colour)
-    canvas.labels[footprint] = number
-    canvas.roof_px[footprint] = height
+    _body(canvas, number, footprint, wings, height, kind, colour)
     for _ in range(rng.integers(0, 5)):  # chimneys, skylights, panels
         spot = centre + turn @ (rng.uniform(-0.4, 0.4, 2) * (length, width))
         size = (
