@@ -56,19 +56,33 @@ def rendered_scenes(count: int, seed: int) -> list[Scene]:
     return scenes
 
 
+@dataclass(frozen=True)
+class _Ground:
+    """A real scene, of which labels it is known where a building ends (:func:`_one_house`), and where crops
+    may lie: (N, 2) rows and columns of labelled pixels."""
+
+    scene: Scene
+    one_house: NDArray[np.bool_]
+    inside: NDArray[np.int64]
+
+    @staticmethod
+    def of(scene: Scene) -> _Ground:
+        """Of a scene no finer than FINEST_GSD_M."""
+        scene = scene.resampled(FINEST_GSD_M) if scene.gsd_m < FINEST_GSD_M else scene
+        return _Ground(scene, _one_house(scene), np.argwhere(scene.labelled[::16, ::16]) * 16)
+
+
 class CropSampler:
-    """Draws crops from scenes held in memory. ``state`` and ``seek`` make a run resumable."""
+    """Draws crops from scenes held in memory; one that is named several times is held once and drawn more
+    often."""
 
     def __init__(self, real: Sequence[Scene], config: CropConfig, seed: int) -> None:
         self._config, self._seed = config, seed
-        self._real = [
-            scene.resampled(FINEST_GSD_M) if scene.gsd_m < FINEST_GSD_M else scene for scene in real
-        ]
+        grounds = {id(scene): _Ground.of(scene) for scene in real}
+        self._real = [grounds[id(scene)] for scene in real]
         # Large places count more than small ones, but not by their area: variety matters.
-        area = np.array([scene.labelled.sum() * scene.gsd_m**2 for scene in self._real]) ** 0.6
+        area = np.array([at.scene.labelled.sum() * at.scene.gsd_m**2 for at in self._real]) ** 0.6
         self._odds = area / area.sum()
-        self._one_house = [_one_house(scene) for scene in self._real]
-        self._inside = [np.argwhere(scene.labelled[::16, ::16]) * 16 for scene in self._real]
         self._rendered = rendered_scenes(config.rendered_scenes, seed) if config.rendered_share > 0.0 else []
 
     def batch(self, step: int, count: int, done: float = 0.0) -> tuple[Image, Image, Image]:
@@ -88,16 +102,16 @@ class CropSampler:
             scene = self._rendered[rng.integers(len(self._rendered))]
             centre = rng.uniform(0.3, 0.7, 2) * RENDERED_SIDE_PX
         else:
-            which = int(rng.choice(len(self._real), p=self._odds))
-            scene = self._real[which]
-            row, column = self._inside[which][rng.integers(len(self._inside[which]))]
+            ground = self._real[int(rng.choice(len(self._real), p=self._odds))]
+            scene = ground.scene
+            row, column = ground.inside[rng.integers(len(ground.inside))]
             centre = np.array([column, row]) + rng.uniform(0.0, 16.0, 2)
         to_scene = _warp(centre, TRAIN_GSD_M / scene.gsd_m, rng, config)
         rgb, labels, known = _cut(scene, to_scene)
         if not is_rendered and rng.random() < config.decoy_share * strength:
             rgb = decoys(rgb, labels, TRAIN_GSD_M, rng)
         rgb = augmented(rgb, labels, TRAIN_GSD_M, strength, rng)
-        split_known = known if is_rendered else known & self._one_house[which][labels]
+        split_known = known if is_rendered else known & ground.one_house[labels]
         target = np.stack([labels > 0, core(labels, TRAIN_GSD_M)]).astype(np.float32)
         return (
             np.ascontiguousarray(rgb.transpose(2, 0, 1)),

@@ -164,7 +164,8 @@ def scenes_of(places: list[str], imagery: Path) -> list[Scene]:
     unknown = [name for name in places if name not in PLACES]
     if unknown:
         raise SystemExit(f"{', '.join(unknown)}: no such place; choose from {', '.join(PLACES)}")
-    return [scene for name in places for scene in place(imagery, name)]
+    scenes = {name: place(imagery, name) for name in dict.fromkeys(places)}
+    return [scene for name in places for scene in scenes[name]]
 
 
 def started_from(model: Path, places: list[str]) -> dict[str, object]:
