@@ -5,7 +5,6 @@ Everything here is at the network's ground sampling distance; a score is a logit
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -20,12 +19,17 @@ LabelImage = NDArray[np.int32]
 # cores, by distance where it does not.
 CORE_INSET_M = 0.6
 MIN_CORE_M2 = 1.0  # smaller ones are noise: a shed of 8 m2 has a core of 2.6 m2
-# A connected part of the mask that is larger than any house and far from the shape of one building is a block
-# of a dense town. There a valley in the score of cores tells houses apart even where it stays above 0.
+# Two cores are told apart by the valley between them in the score of cores. The ridge of a roof looks like
+# one, but the network is not so sure of it.
+VALLEY = -1.0  # logit
+# In a dense town it is as unsure of the gaps: there any valley with enough on both sides parts a core.
+DENSE_VALLEYS = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)  # logits
+MIN_PEAK_M2 = 6.0
+# A town is dense where blocks are a tenth of what is built. A block is a connected part of the mask that is
+# larger than any house and far from the shape of one building.
+DENSE_SHARE = 0.1
 BLOCK_M2 = 500.0
 BLOCK_SOLIDITY = 0.7  # share of its convex hull that one building fills at least
-VALLEYS = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)  # logits
-MIN_PEAK_M2 = 4.0  # of both sides of a valley
 # The line between touching buildings on the wire. The mapper fuses at 0.25 m per pixel: anything narrower
 # than 0.25 m times the root of two, at a slant, would have gaps there.
 GAP_M = 0.4
@@ -82,8 +86,7 @@ def find_instances(
     """
     min_px = min_area_m2 / gsd_m**2
     mask = fill_holes((building > 0.0).view(np.uint8), min_px)
-    valleys = () if core is None else VALLEYS
-    labels = _separated(mask, _depth(mask, core, gsd_m), valleys, gsd_m)
+    labels = _separated(mask, _depth(mask, core, gsd_m), core is not None, gsd_m)
     inside = mask.view(np.bool_)
     numbers = labels[inside]
     pixels = np.bincount(numbers, minlength=1)
@@ -113,16 +116,19 @@ def _components(mask: ByteArray, connectivity: int) -> tuple[int, LabelImage]:
     return count, np.asarray(labels, dtype=np.int32)
 
 
-def _separated(mask: ByteArray, depth: FloatImage, valleys: tuple[float, ...], gsd_m: float) -> LabelImage:
-    """(h, w) 0 outside of the mask, inside a number above 0 for each building.
+def _separated(mask: ByteArray, depth: FloatImage, marked: bool, gsd_m: float) -> LabelImage:
+    """(h, w) 0 outside of the mask, inside a number above 0 for each building; ``marked``: the network marks
+    cores.
 
     Only where a connected part of the mask holds several cores has the watershed anything to decide.
     """
     parts, part = _components(mask, 8)
-    count, core = _components(mask & (depth > 0.0).view(np.uint8), 4)
-    for number, window in _blocks(part, mask, BLOCK_M2 / gsd_m**2) if valleys else ():
-        inside = np.where(part[window] == number, depth[window], np.float32(0.0))
-        count, core[window] = _parted(core[window], count, inside, valleys, MIN_PEAK_M2 / gsd_m**2)
+    valleys: tuple[float, ...] = (0.0,)
+    if marked:
+        valleys = DENSE_VALLEYS if _is_dense(part, mask, gsd_m) else (VALLEY,)
+    count, core = _components(mask & (depth > valleys[0]).view(np.uint8), 4)
+    for level in valleys[1:]:
+        count, core = _parted(core, count, mask & (depth > level).view(np.uint8), MIN_PEAK_M2 / gsd_m**2)
     at, seed, shared = _dividing(core, count, part, parts, MIN_CORE_M2 / gsd_m**2)
     if not shared.any():
         return part
@@ -151,29 +157,25 @@ def _dividing(
     return at, np.where(large & several[home], np.arange(pieces), 0).astype(np.int32)[numbers], several
 
 
-def _blocks(part: LabelImage, mask: ByteArray, min_px: float) -> Iterator[tuple[int, tuple[slice, slice]]]:
-    """The parts of a mask that are blocks of a dense town: number, rows and columns of each."""
-    pixels = np.bincount(part[mask.view(np.bool_)])
-    for number in np.flatnonzero(pixels >= min_px):
-        points = cv2.findNonZero((part == number).view(np.uint8))
-        if pixels[number] < BLOCK_SOLIDITY * cv2.contourArea(cv2.convexHull(points)):
-            left, top, width, height = cv2.boundingRect(points)
-            yield int(number), (slice(top, top + height), slice(left, left + width))
+def _is_dense(part: LabelImage, mask: ByteArray, gsd_m: float) -> bool:
+    """Whether blocks of houses make up enough of the connected parts of a mask."""
+    pixels = np.bincount(part[mask.view(np.bool_)], minlength=1)
+    blocks = 0
+    for number in np.flatnonzero(pixels >= BLOCK_M2 / gsd_m**2):
+        hull = cv2.convexHull(cv2.findNonZero((part == number).view(np.uint8)))
+        if pixels[number] < BLOCK_SOLIDITY * cv2.contourArea(hull):
+            blocks += pixels[number]
+    return bool(blocks > DENSE_SHARE * pixels.sum())
 
 
-def _parted(
-    core: LabelImage, count: int, depth: FloatImage, valleys: tuple[float, ...], min_px: float
-) -> tuple[int, LabelImage]:
-    """How many cores, the background among them, and the number of each pixel's, after each valley of
-    ``depth`` with enough on both sides has parted its core."""
-    core = core.copy()
-    for level in valleys:
-        pieces, piece = _components((depth > level).view(np.uint8), 4)
-        at, seed, several = _dividing(piece, pieces, core, count, min_px)
-        core[np.take(several, core)] = 0
-        core.ravel()[at] = np.where(seed > 0, seed + count, core.ravel()[at])
-        count += pieces
-    return count, core
+def _parted(core: LabelImage, count: int, above: ByteArray, min_px: float) -> tuple[int, LabelImage]:
+    """How many cores, the background among them, and the number of each pixel's, after a valley: what lies
+    ``above`` it replaces the cores that fall into several pieces there."""
+    pieces, piece = _components(above, 4)
+    at, seed, several = _dividing(piece, pieces, core, count, min_px)
+    left = np.where(np.take(several, core), 0, core).astype(np.int32)
+    left.ravel()[at] = np.where(seed > 0, seed + count, left.ravel()[at])
+    return count + pieces, left
 
 
 def _flooded(mask: ByteArray, seeds: LabelImage) -> LabelImage:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from buildloc_segmenter.instances import Instances, draw_mask, fill_holes, find_instances, owned
+from buildloc_segmenter.instances import VALLEY, Instances, draw_mask, fill_holes, find_instances, owned
 from buildloc_segmenter.tiles import blocks
 
 GSD_M = 0.2
@@ -81,13 +81,26 @@ def houses(*cells: tuple[int, int]) -> tuple[Box, ...]:
     return tuple((10 + 60 * i, 10 + 60 * k, 70 + 60 * i, 70 + 60 * k) for i, k in cells)
 
 
-def test_in_a_block_of_a_dense_town_a_valley_between_cores_is_enough() -> None:
+def test_a_ridge_is_a_shallower_valley_than_a_gap() -> None:
+    for low, count in ((0.5, 1), (VALLEY + 0.5, 1), (VALLEY - 0.5, 2), (-5.0, 2)):
+        core = scores((10, 10, 110, 70), inset=3)
+        core[:, 50:70] = np.minimum(core[:, 50:70], low)  # wide enough to reach its depth when it is smoothed
+        assert len(found(scores((10, 10, 110, 70)), core)) == count
+
+
+def test_in_a_dense_town_any_valley_between_cores_is_enough() -> None:
     street = houses((0, 0), (1, 0), (2, 0), (3, 0), (0, 1), (0, 2), (0, 3))  # and another one around a corner
+    pair = houses((5, 5), (6, 5))
     hall = houses(*((i, k) for i in range(4) for k in range(2)))
-    few = street[:3]
-    size = (260, 260)
-    counts = [len(found(scores(*at, size=size), valley(at, size))) for at in (street, hall, few)]
-    assert counts == [7, 1, 1]
+    size = (380, 440)
+    counts = [
+        len(found(scores(*at, size=size), valley(at, size))) for at in (street, hall, pair, street + pair)
+    ]
+    assert counts == [7, 1, 1, 9]
+    # Beside a works of ten times its area the street makes no dense town.
+    size, works = (900, 440), (10, 260, 430, 880)
+    core = np.maximum(valley(street, size), scores(works, inset=3, size=size))
+    assert len(found(scores(*street, works, size=size), core)) == 2
 
 
 @pytest.mark.parametrize(("zoom", "gap_m"), [(2.0, 0.4), (1.0, 0.4), (0.4, 0.75)])
@@ -202,7 +215,7 @@ def test_the_fast_way_finds_what_the_definition_says(seed: int) -> None:
     assert (filled != plain_holes(mask, 60.0)).mean() < 2e-3
     core = np.where(noise > 1.5, 5.0, -5.0).astype(np.float32)
     instances = found(np.where(filled > 0, 5.0, -5.0).astype(np.float32), core, 2.4)
-    smooth = cv2.GaussianBlur(core, (0, 0), 0.6 / GSD_M) > 0.0
+    smooth = cv2.GaussianBlur(core, (0, 0), 0.6 / GSD_M) > VALLEY
     plain = plain_instances(filled, filled & smooth.astype(np.uint8), 25.0, 60.0)
     assert len(instances) == plain.max() > 5
     # Which of two cores is closer is a tie along the line between them, and the flood goes along the axes.
