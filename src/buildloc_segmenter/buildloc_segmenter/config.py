@@ -43,7 +43,7 @@ class SegmenterConfig:
     )
     threshold: float = param(0.5, "building probability that makes a pixel building", 0.01, 0.99)
     min_component_m2: float = param(8.0, "smaller buildings and holes are removed, m2", 0.0, 1000.0)
-    min_score: float = param(0.53, "buildings of a lower mean core probability are removed", 0.0, 1.0)
+    min_score: float = param(0.56, "buildings of a lower mean core probability are removed", 0.0, 1.0)
 
 
 def check_segmenter(config: SegmenterConfig) -> None:

@@ -21,7 +21,7 @@ CORE_INSET_M = 0.6
 MIN_CORE_M2 = 1.0  # smaller ones are noise: a shed of 8 m2 has a core of 2.6 m2
 # Two cores are told apart by the valley between them in the score of cores. The ridge of a roof looks like
 # one, but the network is not so sure of it.
-VALLEY = -1.0  # logit
+VALLEY = -0.75  # logit
 # In a dense town it is as unsure of the gaps: there any valley with enough on both sides parts a core.
 DENSE_VALLEYS = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)  # logits
 MIN_PEAK_M2 = 6.0
