@@ -25,6 +25,7 @@ VALLEY = -0.75  # logit
 # In a dense town it is as unsure of the gaps: there any valley with enough on both sides parts a core.
 DENSE_VALLEYS = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)  # logits
 MIN_PEAK_M2 = 6.0
+DENSE_SCORE = 0.75  # of the score that a building needs elsewhere: such cores are doubtful, not the buildings
 # A town is dense where blocks are a tenth of what is built. A block is a connected part of the mask that is
 # larger than any house and far from the shape of one building.
 DENSE_SHARE = 0.1
@@ -82,11 +83,16 @@ def find_instances(
     connected part of the mask until it meets the next. A part without a core is one building. Holes and
     buildings below ``min_area_m2`` are removed, and buildings that score below ``min_score``: the mean core
     probability of their pixels. The small ones have to be surer, as less of them is core. Without ``core`` it
-    is the building probability. ``image_gsd_m`` is that of the image the mask is for.
+    is the building probability. In a dense town DENSE_SCORE of ``min_score`` is enough. ``image_gsd_m`` is
+    that of the image the mask is for.
     """
     min_px = min_area_m2 / gsd_m**2
     mask = fill_holes((building > 0.0).view(np.uint8), min_px)
-    labels = _separated(mask, _depth(mask, core, gsd_m), core is not None, gsd_m)
+    parts, part = _components(mask, 8)
+    valleys: tuple[float, ...] = (0.0,) if core is None else (VALLEY,)
+    if core is not None and _is_dense(part, mask, gsd_m):
+        valleys, min_score = DENSE_VALLEYS, DENSE_SCORE * min_score
+    labels = _separated(mask, part, parts, _depth(mask, core, gsd_m), valleys, gsd_m)
     inside = mask.view(np.bool_)
     numbers = labels[inside]
     pixels = np.bincount(numbers, minlength=1)
@@ -116,16 +122,15 @@ def _components(mask: ByteArray, connectivity: int) -> tuple[int, LabelImage]:
     return count, np.asarray(labels, dtype=np.int32)
 
 
-def _separated(mask: ByteArray, depth: FloatImage, marked: bool, gsd_m: float) -> LabelImage:
-    """(h, w) 0 outside of the mask, inside a number above 0 for each building; ``marked``: the network marks
-    cores.
+def _separated(
+    mask: ByteArray, part: LabelImage, parts: int, depth: FloatImage, valleys: tuple[float, ...], gsd_m: float
+) -> LabelImage:
+    """(h, w) 0 outside of the mask, inside a number above 0 for each building; ``part`` numbers the connected
+    parts of the mask, ``parts`` with the background. A valley of ``depth`` below the first level parts two
+    cores, one below a further level if it has enough on both sides.
 
     Only where a connected part of the mask holds several cores has the watershed anything to decide.
     """
-    parts, part = _components(mask, 8)
-    valleys: tuple[float, ...] = (0.0,)
-    if marked:
-        valleys = DENSE_VALLEYS if _is_dense(part, mask, gsd_m) else (VALLEY,)
     count, core = _components(mask & (depth > valleys[0]).view(np.uint8), 4)
     for level in valleys[1:]:
         count, core = _parted(core, count, mask & (depth > level).view(np.uint8), MIN_PEAK_M2 / gsd_m**2)

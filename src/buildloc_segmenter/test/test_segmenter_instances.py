@@ -5,7 +5,15 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from buildloc_segmenter.instances import VALLEY, Instances, draw_mask, fill_holes, find_instances, owned
+from buildloc_segmenter.instances import (
+    DENSE_SCORE,
+    VALLEY,
+    Instances,
+    draw_mask,
+    fill_holes,
+    find_instances,
+    owned,
+)
 from buildloc_segmenter.tiles import blocks
 
 GSD_M = 0.2
@@ -101,6 +109,16 @@ def test_in_a_dense_town_any_valley_between_cores_is_enough() -> None:
     size, works = (900, 440), (10, 260, 430, 880)
     core = np.maximum(valley(street, size), scores(works, inset=3, size=size))
     assert len(found(scores(*street, works, size=size), core)) == 2
+
+
+def test_in_a_dense_town_a_building_may_be_less_sure() -> None:
+    pair, street = houses((5, 5), (6, 5)), houses((0, 0), (1, 0), (2, 0), (3, 0), (0, 1), (0, 2), (0, 3))
+    for boxes, share in ((pair, 1.0), (street + pair, DENSE_SCORE)):
+        image, core = scores(*boxes, size=(380, 440)), valley(boxes, (380, 440))
+        every = found(image, core)
+        enough, too_much = 0.99 * every.scores.min() / share, 1.01 * every.scores.max() / share
+        assert len(found(image, core, min_score=enough)) == len(every)
+        assert len(found(image, core, min_score=too_much)) == 0
 
 
 @pytest.mark.parametrize(("zoom", "gap_m"), [(2.0, 0.4), (1.0, 0.4), (0.4, 0.75)])
