@@ -67,7 +67,7 @@ class _Ground:
 
     @staticmethod
     def of(scene: Scene) -> _Ground:
-        """Of a scene no finer than FINEST_GSD_M."""
+        """Of a scene, which is kept no finer than FINEST_GSD_M."""
         scene = scene.resampled(FINEST_GSD_M) if scene.gsd_m < FINEST_GSD_M else scene
         return _Ground(scene, _one_house(scene), np.argwhere(scene.labelled[::16, ::16]) * 16)
 
@@ -78,7 +78,8 @@ class CropSampler:
 
     def __init__(self, real: Sequence[Scene], config: CropConfig, seed: int) -> None:
         self._config, self._seed = config, seed
-        grounds = {id(scene): _Ground.of(scene) for scene in real}
+        once = {id(scene): scene for scene in real}
+        grounds = {key: _Ground.of(scene) for key, scene in once.items()}
         self._real = [grounds[id(scene)] for scene in real]
         # Large places count more than small ones, but not by their area: variety matters.
         area = np.array([at.scene.labelled.sum() * at.scene.gsd_m**2 for at in self._real]) ** 0.6
