@@ -368,18 +368,39 @@ def _body(
     canvas.roof_px[footprint] = height
 
 
-def _attached(canvas: Canvas, number: int, house: Wing, free: NDArray[np.bool_], colour: Image) -> None:
-    """Draw what is built against a house and is part of it, lower and under a roof of its own: a garage, a
-    porch, a later part; where it is ``free``."""
-    rng, (centre, length, width, angle) = canvas.rng, house
+def _attached(canvas: Canvas, house: Wing) -> Wing:
+    """What is built against a house: a garage, a porch, a later part."""
+    rng, (_, length, width, _) = canvas.rng, house
     long, wide = canvas.px(2.5, 7.5), canvas.px(2.5, 6.5)
     if rng.random() < 0.5:
         offset = np.array([(length + long) / 2.0, rng.uniform(-0.5, 0.5) * width])
     else:
         offset = np.array([rng.uniform(-0.5, 0.5) * length, (width + wide) / 2.0])
+    return _beside(house, offset * rng.choice((-1.0, 1.0), 2), long, wide)
+
+
+def _joined(canvas: Canvas, house: Wing) -> tuple[Wing, Wing]:
+    """Another body of a house at some distance, and what joins the two."""
+    rng, (_, length, width, _) = canvas.rng, house
+    gap, long, wide = canvas.px(2.0, 6.0), length * rng.uniform(0.6, 1.1), width * rng.uniform(0.6, 1.1)
+    side, shift = float(rng.choice((-1.0, 1.0))), rng.uniform(-0.4, 0.4) * length
+    other = _beside(house, np.array([shift, side * ((width + wide) / 2.0 + gap)]), long, wide)
+    low, high = max(-length, 2.0 * shift - long) / 2.0, min(length, 2.0 * shift + long) / 2.0
+    along = low + (high - low) * rng.uniform(0.3, 0.7)  # where both bodies are
+    middle = np.array([along, side * (width + gap) / 2.0])
+    return other, _beside(house, middle, (high - low) * rng.uniform(0.3, 1.2), gap + canvas.px(0.0, 2.0))
+
+
+def _beside(house: Wing, offset: Points, length: float, width: float) -> Wing:
+    """A wing whose centre lies at an offset from that of the house, along and across it."""
+    centre, _, _, angle = house
     c, s = math.cos(angle), math.sin(angle)
-    at = centre + np.array([[c, -s], [s, c]]) @ (offset * rng.choice((-1.0, 1.0), 2))
-    wing = (at, long, wide, angle)
+    return centre + np.array([[c, -s], [s, c]]) @ offset, length, width, angle
+
+
+def _lower(canvas: Canvas, number: int, wing: Wing, free: NDArray[np.bool_], colour: Image) -> None:
+    """Draw a part of a house that is lower and under a roof of its own, where it is ``free``."""
+    rng = canvas.rng
     footprint = np.zeros(free.shape, dtype=np.bool_)
     footprint[_where(_inside(free.shape, rectangle(*wing)), free)] = True
     kind = str(rng.choice(("flat", "shed", "gable"), p=(0.5, 0.2, 0.3)))
@@ -388,12 +409,18 @@ def _attached(canvas: Canvas, number: int, house: Wing, free: NDArray[np.bool_],
 
 
 def building(canvas: Canvas, number: int, centre: Points, length: float, width: float, angle: float) -> bool:
-    """Draw one building, of a wing or two and at times something lower built against them, with its shadow;
-    False where another stands."""
+    """Draw one building, of a wing or two, at times with something lower built against or between them, with
+    its shadow; False where another stands."""
     rng = canvas.rng
     turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-    wings = [(centre, length, width, angle)]
-    if rng.random() < 0.35:
+    house = (centre, length, width, angle)
+    wings, lower = [house], list[Wing]()
+    form = rng.random()
+    if form < 0.1:
+        other, link = _joined(canvas, house)
+        wings.append(other)
+        lower.append(link)
+    elif form < 0.45:
         side = np.array([rng.choice((-1, 1)) * (length - width) / 2.0 * 0.95, width / 2.0])
         wings.append(
             (
@@ -411,8 +438,9 @@ def building(canvas: Canvas, number: int, centre: Points, length: float, width: 
         return False
     footprint &= ~taken
     height, colour = canvas.px(2.5, 9.0), _roof_colour(rng)
-    for _ in range(rng.integers(1, 3) if rng.random() < 0.35 else 0):  # first: the house shades it
-        _attached(canvas, number, wings[0], ~(taken | footprint), colour)
+    lower += [_attached(canvas, house) for _ in range(rng.integers(1, 3) if rng.random() < 0.35 else 0)]
+    for wing in lower:  # first: the house shades it
+        _lower(canvas, number, wing, ~(taken | footprint), colour)
     kind = str(rng.choice(("gable", "hip", "flat", "shed"), p=(0.45, 0.2, 0.25, 0.1)))
     _body(canvas, number, footprint, wings, height, kind, colour)
     for _ in range(rng.integers(0, 5)):  # chimneys, skylights, panels
