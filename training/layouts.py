@@ -6,14 +6,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from rendered import GROUNDS, Canvas, Image, Labels, Wing, annexes, building, rectangle
+from rendered import GROUNDS, HEDGE, Canvas, Image, Labels, Wing, annexes, axes, building, rectangle
 
 
 def block(canvas: Canvas, angle: float) -> list[Wing]:
     """A block of a dense town: two rows of houses that touch, back to back. Centre, length, width, angle."""
     rng = canvas.rng
-    along = np.array([math.cos(angle), math.sin(angle)])
-    across = np.array([-along[1], along[0]])
+    along, across = axes(angle)
     corner, depth, plans = canvas.place(), canvas.px(6.0, 14.0), []
     for side in (-1.0, 1.0):
         front = -canvas.px(0.0, 4.0)
@@ -28,8 +27,7 @@ def block(canvas: Canvas, angle: float) -> list[Wing]:
 def street(canvas: Canvas, angle: float) -> list[Wing]:
     """A street of detached houses, each on a plot with a garden, a drive, and often a garage and a shed."""
     rng = canvas.rng
-    along = np.array([math.cos(angle), math.sin(angle)])
-    across = np.array([-along[1], along[0]])
+    along, across = axes(angle)
     middle, plans = canvas.place(), list[Wing]()
     canvas.road(middle, angle)
     setback = canvas.px(5.0, 12.0)
@@ -49,8 +47,7 @@ def street(canvas: Canvas, angle: float) -> list[Wing]:
             if rng.random() < 0.6:
                 fence = plot + along * width / 2.0
                 line = rectangle(fence, canvas.px(0.2, 1.4), depth, angle)
-                canvas.shade(line, canvas.px(0.6, 1.8))
-                canvas.paint(line, np.float32([52, 72, 40]) * np.float32(rng.uniform(0.6, 1.6)), 9.0)
+                canvas.wall(line, canvas.px(0.6, 1.8), HEDGE * np.float32(rng.uniform(0.6, 1.6)))
             home = plot - across * side * depth * rng.uniform(0.0, 0.25)
             size = tuple(length * rng.uniform(0.85, 1.15) for length in house)
             own = angle + (math.pi / 2.0 if gable_on else 0.0) + rng.normal(0.0, 0.03)
@@ -97,7 +94,7 @@ def render(side_px: int, gsd_m: float, rng: np.random.Generator) -> tuple[Image,
             length, width = canvas.px(18.0, 45.0), canvas.px(9.0, 22.0)
         at, own = canvas.place(), angle + rng.choice((0.0, math.pi / 2.0)) + rng.normal(0.0, 0.12)
         row = int(rng.integers(2, 6)) if rng.random() < (0.7 if dense else 0.1) else 1  # a terrace of houses
-        step = np.array([math.cos(own), math.sin(own)]) * length
+        step = axes(own)[0] * length
         plans += [(at + step * k, length, width * rng.uniform(0.85, 1.15), own) for k in range(row)]
     for plan in plans:
         annexes(canvas, *plan)

@@ -55,6 +55,7 @@ ROOFS = np.array(
 CARS = np.array(
     [[230, 230, 230], [40, 42, 46], [120, 124, 130], [150, 40, 36], [40, 60, 120]], dtype=np.float32
 )
+HEDGE = np.array([50, 72, 38], dtype=np.float32)
 SUBPIXEL = 4
 
 
@@ -92,11 +93,16 @@ def _where(pixels: Pixels, plane: NDArray[np.bool_]) -> Pixels:
     return pixels[0][kept], pixels[1][kept]
 
 
+def axes(angle: float) -> Points:
+    """(2, 2) unit vectors along an angle and across it."""
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, s], [-s, c]])
+
+
 def rectangle(centre: Points, length: float, width: float, angle: float) -> Points:
     """Corners (4, 2) of a rectangle, its length along ``angle``."""
-    along = np.array([math.cos(angle), math.sin(angle)]) * length / 2.0
-    across = np.array([-math.sin(angle), math.cos(angle)]) * width / 2.0
-    return centre + np.array([along + across, -along + across, -along - across, along - across])
+    corners = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]) * (length / 2.0, width / 2.0)
+    return centre + corners @ axes(angle)
 
 
 @dataclass(frozen=True)
@@ -114,8 +120,7 @@ class Light:
         """A sun anywhere from high to low, or an overcast sky."""
         angle = rng.uniform(0.0, math.tau)
         shade = rng.uniform(0.15, 0.6) if rng.random() < 0.8 else rng.uniform(0.8, 1.0)
-        away = np.array([math.cos(angle), math.sin(angle)])
-        return Light(away, rng.uniform(0.3, 1.8), shade, rng.normal(0.0, 0.12, 2))
+        return Light(axes(angle)[0], rng.uniform(0.3, 1.8), shade, rng.normal(0.0, 0.12, 2))
 
     def shadow(self, outline: Points, height_px: float) -> Points:
         """The outline of a body together with its shadow."""
@@ -184,9 +189,9 @@ class Canvas:
         if self.rng.random() < 0.4:
             self.paint(rectangle(centre, 3.0 * self.side, 0.15 / self.gsd, angle), colour * 0 + 220, 4.0)
         for _ in range(self.rng.integers(0, 4)):
-            side = np.array([-math.sin(angle), math.cos(angle)]) * width * self.rng.uniform(-0.4, 0.4)
-            along = np.array([math.cos(angle), math.sin(angle)]) * self.rng.uniform(-0.7, 0.7) * self.side
-            self.car(centre + side + along, angle)
+            side = width * self.rng.uniform(-0.4, 0.4)
+            offset = np.array([self.rng.uniform(-0.7, 0.7) * self.side, side])
+            self.car(centre + offset @ axes(angle), angle)
 
     def yard(self, centre: Points, angle: float) -> None:
         """Bare paving."""
@@ -198,10 +203,7 @@ class Canvas:
         length, depth = self.px(8.0, 30.0), self.px(5.0, 18.0)
         colour = self.paving()
         self.paint(rectangle(centre, length, depth, angle), colour, 4.0)
-        along, across = (
-            np.array([math.cos(angle), math.sin(angle)]),
-            np.array([-math.sin(angle), math.cos(angle)]),
-        )
+        along, across = axes(angle)
         bay = 2.5 / self.gsd
         for k in range(int(length / bay)):
             at = centre + along * ((k + 0.5) * bay - length / 2.0) + across * (depth / 2.0 - 2.5 / self.gsd)
@@ -234,20 +236,21 @@ class Canvas:
     def hedge(self, centre: Points, angle: float) -> None:
         """A hedge, fence or wall with its shadow."""
         line = rectangle(centre, self.px(6.0, 35.0), self.px(0.2, 1.6), angle)
-        self.shade(line, self.px(0.8, 2.0))
-        green = np.array([50, 72, 38], dtype=np.float32)
-        colour = (
-            green * np.float32(self.rng.uniform(0.6, 1.3)) if self.rng.random() < 0.6 else self.paving() * 1.2
-        )
-        self.paint(line, colour, 9.0)
+        height = self.px(0.8, 2.0)
+        green = HEDGE * np.float32(self.rng.uniform(0.6, 1.3))
+        self.wall(line, height, green if self.rng.random() < 0.6 else self.paving() * 1.2)
+
+    def wall(self, outline: Points, height_px: float, colour: Image) -> None:
+        """Something too low or too narrow to be a building, with its shadow."""
+        self.shade(outline, height_px)
+        self.paint(outline, colour, 9.0)
 
     def enclosure(self, centre: Points, angle: float) -> None:
         """A garden, a bed or a court within a hedge or a low wall."""
         length, width, thick = self.px(5.0, 16.0), self.px(4.0, 12.0), self.px(0.3, 1.4)
         ring = rectangle(centre, length, width, angle)
-        self.shade(ring, self.px(0.6, 1.8))
-        green = np.array([50, 72, 38], dtype=np.float32) * np.float32(self.rng.uniform(0.6, 1.3))
-        self.paint(ring, green if self.rng.random() < 0.7 else self.paving(), 9.0)
+        height, green = self.px(0.6, 1.8), HEDGE * np.float32(self.rng.uniform(0.6, 1.3))
+        self.wall(ring, height, green if self.rng.random() < 0.7 else self.paving())
         ground = GROUNDS[self.rng.integers(len(GROUNDS))] if self.rng.random() < 0.7 else self.paving()
         self.paint(rectangle(centre, length - 2.0 * thick, width - 2.0 * thick, angle), ground, 7.0)
 
@@ -355,10 +358,10 @@ def _body(
     for at, long, wide, a in wings:
         if rng.random() < 0.25:
             colour = _roof_colour(rng)
-        t = np.array([[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]])
+        turn = axes(a)
         for face, downhill in _roof_faces(long, wide, kind):
-            rows, columns = where = _where(_inside(footprint.shape, at + face @ t.T), footprint)
-            lit = max(0.3, 1.0 - contrast * float((t @ downhill) @ canvas.light.away))
+            rows, columns = where = _where(_inside(footprint.shape, at + face @ turn), footprint)
+            lit = max(0.3, 1.0 - contrast * float(downhill @ turn @ canvas.light.away))
             along = columns * math.cos(a) + rows * math.sin(a)
             ribs = 1.0 + amplitude * np.sin(along * (math.tau / max(stripes, 2.2)))
             canvas.rgb[where] = colour * lit * ribs[:, None] + canvas.fine[where] * rng.uniform(1.0, 8.0)
@@ -394,8 +397,7 @@ def _joined(canvas: Canvas, house: Wing) -> tuple[Wing, Wing]:
 def _beside(house: Wing, offset: Points, length: float, width: float) -> Wing:
     """A wing whose centre lies at an offset from that of the house, along and across it."""
     centre, _, _, angle = house
-    c, s = math.cos(angle), math.sin(angle)
-    return centre + np.array([[c, -s], [s, c]]) @ offset, length, width, angle
+    return centre + offset @ axes(angle), length, width, angle
 
 
 def _lower(canvas: Canvas, number: int, wing: Wing, free: NDArray[np.bool_], colour: Image) -> None:
@@ -412,7 +414,7 @@ def building(canvas: Canvas, number: int, centre: Points, length: float, width: 
     """Draw one building, of a wing or two, at times with something lower built against or between them, with
     its shadow; False where another stands."""
     rng = canvas.rng
-    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    turn = axes(angle)
     house = (centre, length, width, angle)
     wings, lower = [house], list[Wing]()
     form = rng.random()
@@ -424,7 +426,7 @@ def building(canvas: Canvas, number: int, centre: Points, length: float, width: 
         side = np.array([rng.choice((-1, 1)) * (length - width) / 2.0 * 0.95, width / 2.0])
         wings.append(
             (
-                centre + turn @ side,
+                centre + side @ turn,
                 width * rng.uniform(0.9, 1.6),
                 width * rng.uniform(0.5, 0.95),
                 angle + math.pi / 2,
@@ -444,7 +446,7 @@ def building(canvas: Canvas, number: int, centre: Points, length: float, width: 
     kind = str(rng.choice(("gable", "hip", "flat", "shed"), p=(0.45, 0.2, 0.25, 0.1)))
     _body(canvas, number, footprint, wings, height, kind, colour)
     for _ in range(rng.integers(0, 5)):  # chimneys, skylights, panels
-        spot = centre + turn @ (rng.uniform(-0.4, 0.4, 2) * (length, width))
+        spot = centre + (rng.uniform(-0.4, 0.4, 2) * (length, width)) @ turn
         size = (
             (canvas.px(0.5, 1.5), canvas.px(0.5, 1.5))
             if rng.random() < 0.7
@@ -459,10 +461,7 @@ def building(canvas: Canvas, number: int, centre: Points, length: float, width: 
 def annexes(canvas: Canvas, centre: Points, length: float, width: float, angle: float) -> None:
     """Driveway, terrace, lawn or yard about a building: rectangles along its walls that are no building."""
     rng = canvas.rng
-    along, across = (
-        np.array([math.cos(angle), math.sin(angle)]),
-        np.array([-math.sin(angle), math.cos(angle)]),
-    )
+    along, across = axes(angle)
     if rng.random() < 0.5:
         plot = rectangle(centre, length + canvas.px(6, 20), width + canvas.px(6, 20), angle)
         canvas.paint(plot, GROUNDS[rng.integers(len(GROUNDS))] * rng.uniform(0.8, 1.2), 8.0)
