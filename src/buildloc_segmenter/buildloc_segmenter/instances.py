@@ -107,8 +107,8 @@ def find_instances(
 
 
 def _depth(mask: ByteArray, core: FloatImage | None, gsd_m: float) -> FloatImage:
-    """(h, w) how deep in its own building a pixel of the mask lies, above 0 in cores: a logit where the
-    network marks cores, metres to the edge where it does not."""
+    """(h, w) how deep in its own building a pixel of the mask lies: the logit of being core where the network
+    marks cores, metres by which the edge is farther than CORE_INSET_M where it does not."""
     if core is None:
         distance = cv2.distanceTransform(mask, cv2.DIST_L2, 3)
         return np.asarray(distance * np.float32(gsd_m) - np.float32(CORE_INSET_M), dtype=np.float32)
