@@ -23,7 +23,7 @@ Pictures = Sequence[tuple[str, Path]]
 
 def _cell(value: Any) -> str:
     if isinstance(value, dict):
-        return _table(value)
+        return _entries(value)
     if _is_rows(value):
         return _rows(value)
     if isinstance(value, list | tuple) and value:
@@ -31,6 +31,25 @@ def _cell(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     return html.escape("none" if value is None or value == [] else str(value))
+
+
+def _entries(values: dict[str, Any]) -> str:
+    """Those that are alike, such as the bars of an evaluation, in one table, short side across; the others
+    follow."""
+    plain = {name: value for name, value in values.items() if _is_plain(value)}
+    if len(plain) < 2 or not set.intersection(*map(set, plain.values())):
+        return _table(values)
+    keys = list(dict.fromkeys(key for row in plain.values() for key in row))
+    if len(keys) > len(plain):
+        rows = [{"": key} | {n: row[key] for n, row in plain.items() if key in row} for key in keys]
+    else:
+        rows = [{"": name} | row for name, row in plain.items()]
+    others = {name: value for name, value in values.items() if name not in plain}
+    return _rows(rows) + (_table(others) if others else "")
+
+
+def _is_plain(value: Any) -> bool:
+    return isinstance(value, dict) and not any(isinstance(one, dict | list | tuple) for one in value.values())
 
 
 def _is_rows(value: Any) -> bool:
@@ -68,7 +87,7 @@ def _rows(rows: list[dict[str, Any]]) -> str:
     """A table with a column for every key."""
     keys = list(dict.fromkeys(key for row in rows for key in row))
     head = "".join(f"<th>{html.escape(str(key))}</th>" for key in keys)
-    body = "".join("<tr>" + "".join(_column(row.get(key)) for key in keys) + "</tr>" for row in rows)
+    body = "".join("<tr>" + "".join(_column(row.get(key, "")) for key in keys) + "</tr>" for row in rows)
     return f"<table><tr>{head}</tr>{body}</table>"
 
 

@@ -33,7 +33,7 @@ from buildloc_eval.segmentation_bars import case_bars, speed_bars
 from buildloc_eval.segmentation_errors import POOLED, SegmentationErrors, measured, summary, write_errors
 from buildloc_eval.segmented import MAPPED_AREA_M2, SCORED_GSD_M, Scored, busiest, disturbed, score
 from buildloc_eval.speed import frame_jpeg, speed, speed_table
-from buildloc_eval.trained_on import trained_on
+from buildloc_eval.trained_on import runs, trained_on, training_line
 
 Progress = Callable[[str], None]
 
@@ -196,7 +196,7 @@ def run_case(case: Case, plan: Plan, imagery: Path, out: Path, progress: Progres
     report = {
         "place": case.place,
         "model": case.model or "shipped",
-        "trained on": training or "its file does not say",
+        "trained on": runs(training),
         "all scenes": scores_of(everything),
         "scenes": scenes,
         "disturbed input": robustness(network, widest, progress),
@@ -232,15 +232,16 @@ def evaluate(out: Path, plan: Plan, progress: Progress) -> str:
     imagery = data_folder() / "imagery"
     out.mkdir(parents=True, exist_ok=True)
     results = [run_case(case, plan, imagery, out, progress) for case in plan.cases]
-    trained = {f"{r.report['model']} on {r.report['place']}": r.report["trained on"] for r in results}
+    reports = [result.report for result in results]
+    trained = {f"{r['model']} on {r['place']}": training_line(r["trained on"]) for r in reports}
     errors = {} if plan.errors is None else error_model(results)
     speeds: dict[str, Any] = {}
     if plan.speed:
         progress("speed")
         speeds = speed(frame_jpeg(imagery), plan.speed, plan.config)
     bars = speed_bars(speeds)
-    for result in results:
-        bars |= case_bars(result.report)
+    for case in reports:
+        bars |= case_bars(case)
     report = {
         "evaluation": "segmentation",
         "what is real": REAL,
@@ -253,19 +254,17 @@ def evaluate(out: Path, plan: Plan, progress: Progress) -> str:
         "bars": bars,
         "speed": speeds,
         "error model": {name: asdict(values) for name, values in errors.items()},
-        "cases": {f"{r.report['place']}, {r.report['model']}": r.report for r in results},
+        "cases": {f"{r['place']}, {r['model']}": r for r in reports},
     }
     (out / "report.json").write_text(json.dumps(report, indent=2) + "\n")
     pictures = [picture for result in results for picture in result.pictures]
     write_report(out / "report.html", "Segmentation of ground never seen", report, pictures)
     if plan.errors is not None:
         # It ships: files by their names, not by where they lay here.
-        names = {
-            f"{Path(r.report['model']).name}, {r.report['place']}": r.report["trained on"] for r in results
-        }
+        names = {f"{Path(r['model']).name}, {r['place']}": r["trained on"] for r in reports}
         about = {key: report[key] for key in ("what is real", "seed", "quick", "date")}
         write_errors(plan.errors, about | {"network, place: what trained it": names}, errors)
-    lines = [table([r.report for r in results]), *speed_table(speeds), *summary(errors), bar_table(bars)]
+    lines = [table(reports), *speed_table(speeds), *summary(errors), bar_table(bars)]
     return "\n".join(lines)
 
 
@@ -290,7 +289,7 @@ def table(reports: Sequence[dict[str, Any]]) -> str:
         return f"{name:<28} {kind:<9} {cells}"
 
     for report in reports:
-        lines.append(f"{report['model']}, trained on: {json.dumps(report['trained on'])}")
+        lines.append(f"{report['model']}: {training_line(report['trained on'])}")
         groups = report["scenes"] | ({"all": report["all scenes"]} if len(report["scenes"]) > 1 else {})
         for scene, values in groups.items():
             name = f"{report['place']}, {scene}" if scene != report["place"] else scene

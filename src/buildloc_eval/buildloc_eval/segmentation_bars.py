@@ -33,7 +33,7 @@ EQUAL_MASK_SHARE = 0.999
 def case_bars(report: Mapping[str, Any]) -> Judged:
     """The bars of a network on a place, by the case's part of the report."""
     place, trained, every = report["place"], report["trained on"], report["all scenes"]
-    places = trained["places"] if isinstance(trained, Mapping) else []
+    places = trained[-1]["places"] if trained else []
     limits = {
         "barnarp": UNSEEN,
         "barnarp_east": OTHER_HALF_SEEN if "barnarp_west" in places else UNSEEN,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
+from collections.abc import Sequence
 from typing import Any
 
 from buildloc_msgs_py.errors import BuildlocError
@@ -29,3 +31,22 @@ def trained_on(network: Network) -> dict[str, Any] | None:
             f"metadata {TRAINING_KEY}: {text!r} names no places; export the network again"
         )
     return training
+
+
+def runs(training: dict[str, Any] | None) -> list[dict[str, Any]]:
+    """The runs of a training since the pretrained encoder, each after the one before; [] where not known."""
+    if training is None:
+        return []
+    before = training.get("start")
+    own = {key: value for key, value in training.items() if key != "start"}
+    return [*runs(before if isinstance(before, dict) else None), own]
+
+
+def training_line(of_runs: Sequence[dict[str, Any]]) -> str:
+    """For people: the steps of each run, and the ground of the last one, which is all of it."""
+    if not of_runs:
+        return "its file does not say what trained it"
+    steps = " + ".join(str(run.get("steps", "?")) for run in of_runs)
+    times = Counter(of_runs[-1]["places"])
+    ground = ", ".join(name if n == 1 else f"{name} ({n} times)" for name, n in times.items())
+    return f"{steps} steps on {ground}"

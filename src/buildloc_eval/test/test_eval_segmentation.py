@@ -195,7 +195,7 @@ def test_the_table_has_a_row_for_each_scene_and_way_of_counting() -> None:
     kinds: dict[str, Any] = dict.fromkeys(KINDS, values | {"centroid_p90_m": None})
     kinds |= {"merged over plain": 0.25}
     report = {
-        "place": "banepa", "model": "net.onnx", "trained on": {"places": ["zanzibar"]}, "all scenes": kinds,
+        "place": "banepa", "model": "net.onnx", "trained on": [{"places": ["zanzibar"]}], "all scenes": kinds,
         "scenes": {"a": kinds, "b": kinds},
         "disturbed input": {"as it comes": {"pixel_iou": 0.7}, "low": {"pixel_iou": 0.6, "falls_by": 0.1}},
     }  # fmt: skip
@@ -218,7 +218,7 @@ def case_report(place: str, trained: list[str], **figures: float) -> dict[str, A
     good = {"pixel_iou": 0.9, "recall_0.3": 0.98, "precision_0.3": 0.95, "centroid_median_m": 0.3,
             "centroid_p90_m": 1.0}  # fmt: skip
     return {
-        "place": place, "model": "net.onnx", "trained on": {"places": trained},
+        "place": place, "model": "net.onnx", "trained on": [{"places": trained}],
         "all scenes": {"instances": good | figures},
         "scenes": {"banepa_ortho": {"merged over plain": figures.get("merged", 0.3)}},
         "disturbed input": {"as it comes": {"pixel_iou": 0.7}, "low": {"falls_by": figures.get("fall", 0.01)},

@@ -6,7 +6,13 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
-from buildloc_eval.trained_on import TRAINING_KEY, TrainingNotesError, trained_on
+from buildloc_eval.trained_on import (
+    TRAINING_KEY,
+    TrainingNotesError,
+    runs,
+    trained_on,
+    training_line,
+)
 
 
 def network(**metadata: str) -> Any:
@@ -18,6 +24,14 @@ def test_a_network_tells_its_places_or_has_no_word_of_them() -> None:
         "places": ["banepa"], "steps": 3,
     }  # fmt: skip
     assert trained_on(network(author="somebody")) is None
+
+
+def test_runs_come_in_order_and_their_line_names_the_ground_once() -> None:
+    first: dict[str, Any] = {"places": ["banepa"], "steps": 3}
+    second = {"places": ["banepa", "zanzibar", "banepa"], "steps": 5}
+    assert runs(second | {"start": first}) == [first, second]
+    assert training_line([first, second]) == "3 + 5 steps on banepa (2 times), zanzibar"
+    assert runs(None) == [] and training_line([]) == "its file does not say what trained it"
 
 
 @pytest.mark.parametrize("text", ["trained by hand", "[]", "{}", '{"places": "banepa"}', ""])
