@@ -103,6 +103,27 @@ def test_a_run_goes_on_from_an_exported_network(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_a_run_is_averaged_with_the_one_before_it(tmp_path: Path) -> None:
+    from export import averaged
+
+    runs = [tmp_path / name for name in ("later", "earlier")]
+    for folder, steps in zip(runs, (3, 1), strict=True):
+        folder.mkdir()
+        training, _ = trained("lite0", steps)
+        places = ["squares"] + ["circles"] * (steps == 3)
+        training.save(folder / "checkpoint.pt", {"network": "lite0", "places": places})
+    later, earlier, mean = (averaged(some)[0].state_dict() for some in (runs[:1], runs[1:], runs))
+    for name, value in mean.items():
+        assert torch.allclose(value.float(), (later[name].float() + earlier[name].float()) / 2), name
+    assert any(not torch.equal(mean[name], later[name]) for name in mean)
+    told = averaged(runs)[1]
+    assert told["places"] == ["squares", "circles"]
+    assert [one["step"] for one in told["averaged_with"]] == [1]
+    with pytest.raises(SystemExit, match=r"later: has seen circles too"):
+        averaged(runs[::-1])
+
+
+@pytest.mark.slow
 def test_int8_says_nearly_the_same(tmp_path: Path) -> None:
     from export import agreement, quantise, write_onnx
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -42,6 +42,7 @@ CONTRACT = {
 }  # fmt: skip
 PARITY_CROPS, CALIBRATION_CROPS = 16, 64
 OPSET = 17
+AVERAGE_HELP = "other runs, which it went on from, to take the mean weights with"
 
 
 def write_onnx(net: nn.Module, path: Path, training: dict[str, object]) -> None:
@@ -124,14 +125,35 @@ def load(folder: Path) -> tuple[BuildingNet | SegFormer, dict[str, object]]:
     }
 
 
+def averaged(folders: Sequence[Path]) -> tuple[BuildingNet | SegFormer, dict[str, object]]:
+    """The mean, weight by weight, of several checkpoints' networks, and how the first one was trained.
+
+    It means something only where the first went on from the others. Raises SystemExit for another network,
+    and for one that has seen more ground.
+    """
+    (net, training), *others = [load(folder) for folder in folders]
+    if not others:
+        return net, training
+    states = [one.state_dict() for one in (net, *(other for other, _ in others))]
+    for folder, state, (_, other) in zip(folders[1:], states[1:], others, strict=True):
+        if {k: v.shape for k, v in state.items()} != {k: v.shape for k, v in states[0].items()}:
+            raise SystemExit(f"{folder}: is another network than {folders[0]}; average runs of one")
+        if more := sorted(set(other["places"]) - set(training["places"])):  # type: ignore[call-overload]
+            raise SystemExit(f"{folder}: has seen {', '.join(more)} too; name that run first")
+    net.load_state_dict({name: sum(state[name] for state in states) / len(states) for name in states[0]})
+    return net, {**training, "averaged_with": [other for _, other in others]}
+
+
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("folder", type=Path, help="the --out of training/train.py")
-    folder = parser.parse_args().folder
-    net, training = load(folder)
+    parser.add_argument("--average", nargs="+", default=[], metavar="RUN", type=Path, help=AVERAGE_HELP)
+    args = parser.parse_args()
+    folder: Path = args.folder
+    net, training = averaged([folder, *args.average])
     imagery = Path(os.environ.get("BUILDLOC_DATA", REPOSITORY / "../shared/data")) / "imagery"
     scenes = [scene for name in training["places"] for scene in place(imagery, name)]  # type: ignore[attr-defined]
     sampler = CropSampler(scenes, CropConfig(rendered_share=0.0, decoy_share=0.0), seed=0)

@@ -34,11 +34,16 @@ def trained_on(network: Network) -> dict[str, Any] | None:
 
 
 def runs(training: dict[str, Any] | None) -> list[dict[str, Any]]:
-    """The runs of a training since the pretrained encoder, each after the one before; [] where not known."""
+    """The runs of a training since the pretrained encoder, each after the one before; [] where not known.
+
+    Of one whose weights were averaged with those of others the number of these stays.
+    """
     if training is None:
         return []
     before = training.get("start")
     own = {key: value for key, value in training.items() if key != "start"}
+    if "averaged_with" in own:
+        own["averaged_with"] = len(own["averaged_with"])
     return [*runs(before if isinstance(before, dict) else None), own]
 
 
@@ -49,4 +54,5 @@ def training_line(of_runs: Sequence[dict[str, Any]]) -> str:
     steps = " + ".join(str(run.get("steps", "?")) for run in of_runs)
     times = Counter(of_runs[-1]["places"])
     ground = ", ".join(name if n == 1 else f"{name} ({n} times)" for name, n in times.items())
-    return f"{steps} steps on {ground}"
+    last = ", averaged with earlier runs" if "averaged_with" in of_runs[-1] else ""
+    return f"{steps} steps on {ground}{last}"
