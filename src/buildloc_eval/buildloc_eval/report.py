@@ -89,7 +89,9 @@ def picture(
     to_utm = Transformer.from_crs(4326, database.epsg, always_xy=True)
     fixes = np.array([to_utm.transform(f.longitude_deg, f.latitude_deg) for f in scored.fixes]).reshape(-1, 2)
     origin = flown.mean(axis=0)
-    figure, (whole, close) = plt.subplots(1, 2, figsize=(15, 7.5))
+    figure = plt.figure(figsize=(15, 7.5), layout="constrained")
+    halves = figure.subfigures(1, 2, squeeze=False)[0]  # each has a shape of its own
+    whole, close = (half.subplots() for half in halves)
     for axes, size in ((whole, 1.0), (close, 14.0)):
         axes.scatter(*(database.centroids_m - origin).T, s=size, c="0.72", label="reference buildings")
         axes.plot(*(flown - origin).T, c="tab:blue", lw=1.8, label="true path")
@@ -114,6 +116,5 @@ def picture(
     close.set_title(f"{len(scored.fixes)} fixes, {last}")
     close.legend(loc="upper right", fontsize=8, framealpha=0.9)
     figure.suptitle(title)
-    figure.tight_layout()
     figure.savefig(path, dpi=110)
     plt.close(figure)
