@@ -35,6 +35,7 @@ from buildloc_eval.paper.report import (
 from buildloc_eval.paper.scoring import error_row, recall_row
 from buildloc_eval.paper.tokyo import TokyoFlight
 from buildloc_eval.segmentation_errors import Outlines
+from buildloc_eval.trained_on import runs
 
 TOKYO = [
     "real: the footprints, PLATEAU (government model, roof edges) and OpenStreetMap, each drawn by its own "
@@ -209,7 +210,10 @@ def real_imagery(
     ]
     missing = [f"{place} was left out: {reason}" for place, reason in left_out.items()]
     said = told(IMAGERY, missing, rows, scored, traces, groups, plan) | {
-        "networks": {place: asdict(network) for place, network in networks.items()}
+        "networks": {
+            place: {"model": one.model or "shipped", "sha256": one.sha256, "training": runs(one.training)}
+            for place, one in networks.items()
+        }
     }
     pictures = []
     if flights:
