@@ -12,7 +12,7 @@ from augment import augmented, coarse, colours, snow
 from buildloc_eval.places import Scene
 from crops import CROP_PX, ONE_HOUSE_M2, CropConfig, CropSampler, core
 from layouts import block, decoys, render, street
-from rendered import Canvas, Light, building, rectangle
+from rendered import Canvas, Light, building, joined, rectangle
 
 PLAIN = CropConfig(rendered_share=0.0, decoy_share=0.0)
 
@@ -163,6 +163,15 @@ def test_what_is_built_against_a_house_is_part_of_it_and_lower() -> None:
         assert (heights[:-1] < 3.4).all() or heights.max() < 3.4
         assert canvas.roof_px[100, 100] * 0.2 in heights and not canvas.roof_px[canvas.labels == 0].any()
     assert 5 < several < 30
+
+
+def test_what_joins_two_bodies_of_a_house_reaches_both() -> None:
+    house = (np.array([100.0, 100.0]), 60.0, 45.0, 0.3)
+    for seed in range(20):
+        canvas = Canvas(64, 0.2, np.random.default_rng(seed))
+        one, other, link = (shapely.Polygon(rectangle(*wing)) for wing in (house, *joined(canvas, house)))
+        assert 2.0 <= one.distance(other) * 0.2 <= 6.0
+        assert link.distance(one) < 1e-6 and link.distance(other) < 1e-6
 
 
 def test_tall_houses_shade_lower_roofs_and_not_higher_ones() -> None:

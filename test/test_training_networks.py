@@ -103,24 +103,31 @@ def test_a_run_goes_on_from_an_exported_network(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_run_is_averaged_with_the_one_before_it(tmp_path: Path) -> None:
-    from export import averaged
+def test_a_run_is_averaged_with_one_that_it_went_on_from(tmp_path: Path) -> None:
+    from export import averaged, load, write_onnx
+    from networks import folded, network, take_weights
+    from train import Training
 
-    runs = [tmp_path / name for name in ("later", "earlier")]
-    for folder, steps in zip(runs, (3, 1), strict=True):
-        folder.mkdir()
-        training, _ = trained("lite0", steps)
-        places = ["squares"] + ["circles"] * (steps == 3)
-        training.save(folder / "checkpoint.pt", {"network": "lite0", "places": places})
-    later, earlier, mean = (averaged(some)[0].state_dict() for some in (runs[:1], runs[1:], runs))
-    for name, value in mean.items():
-        assert torch.allclose(value.float(), (later[name].float() + earlier[name].float()) / 2), name
-    assert any(not torch.equal(mean[name], later[name]) for name in mean)
-    told = averaged(runs)[1]
-    assert told["places"] == ["squares", "circles"]
-    assert [one["step"] for one in told["averaged_with"]] == [1]
-    with pytest.raises(SystemExit, match=r"later: has seen circles too"):
-        averaged(runs[::-1])
+    earlier, other = tmp_path / "earlier.onnx", tmp_path / "other.onnx"
+    notes = {"places": ["squares"], "steps": 3}
+    for path, steps, told in ((earlier, 3, notes), (other, 1, notes | {"steps": 1})):
+        write_onnx(trained("lite0", steps)[0].average, path, told)
+    net, before = network("lite0"), network("lite0")
+    for one in (net, before):
+        take_weights(folded(one), earlier)
+    later = Training(net, 30, torch.device("cpu"))
+    later.net.train()
+    later.advance(*batch(0))
+    settings = {"network": "lite0", "places": ["squares", "circles"], "start": notes}
+    later.save(tmp_path / "checkpoint.pt", settings)
+    mean, training = averaged(*load(tmp_path), [earlier])
+    assert training["averaged_with_runs_before"] == [1] and training["start"] == notes
+    first, second = later.average.state_dict(), before.state_dict()
+    for name, value in mean.state_dict().items():
+        assert torch.allclose(value, (first[name] + second[name]) / 2.0, atol=1e-7), name
+    assert any(not torch.equal(first[name], second[name]) for name in first)
+    with pytest.raises(SystemExit, match=r"other.onnx: is none that this run went on from"):
+        averaged(*load(tmp_path), [other])
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ import onnxruntime
 import torch
 from buildloc_eval.places import place
 from crops import TRAIN_GSD_M, CropConfig, CropSampler
-from networks import CHANNELS, BuildingNet, SegFormer, folded, network
+from networks import CHANNELS, BuildingNet, SegFormer, folded, network, take_weights
 from numpy.typing import NDArray
 from onnxruntime.quantization import (
     CalibrationDataReader,
@@ -32,7 +32,7 @@ from onnxruntime.quantization import (
 )
 from onnxruntime.quantization.shape_inference import quant_pre_process
 from torch import nn
-from train import REPOSITORY
+from train import REPOSITORY, notes_of
 
 Batch = NDArray[np.float32]
 CONTRACT = {
@@ -42,7 +42,7 @@ CONTRACT = {
 }  # fmt: skip
 PARITY_CROPS, CALIBRATION_CROPS = 16, 64
 OPSET = 17
-AVERAGE_HELP = "other runs, which it went on from, to take the mean weights with"
+AVERAGE_HELP = "exported float32 networks that it went on from: take the mean weights with theirs"
 
 
 def write_onnx(net: nn.Module, path: Path, training: dict[str, object]) -> None:
@@ -125,23 +125,28 @@ def load(folder: Path) -> tuple[BuildingNet | SegFormer, dict[str, object]]:
     }
 
 
-def averaged(folders: Sequence[Path]) -> tuple[BuildingNet | SegFormer, dict[str, object]]:
-    """The mean, weight by weight, of several checkpoints' networks, and how the first one was trained.
+def averaged(
+    net: BuildingNet | SegFormer, training: dict[str, object], models: Sequence[Path]
+) -> tuple[BuildingNet | SegFormer, dict[str, object]]:
+    """The mean, weight by weight, with exported networks that this one went on from, and how it was trained.
 
-    It means something only where the first went on from the others. Raises SystemExit for another network,
-    and for one that has seen more ground.
+    Raises SystemExit for any other network: the mean of unrelated weights says nothing.
     """
-    (net, training), *others = [load(folder) for folder in folders]
-    if not others:
-        return net, training
-    states = [one.state_dict() for one in (net, *(other for other, _ in others))]
-    for folder, state, (_, other) in zip(folders[1:], states[1:], others, strict=True):
-        if {k: v.shape for k, v in state.items()} != {k: v.shape for k, v in states[0].items()}:
-            raise SystemExit(f"{folder}: is another network than {folders[0]}; average runs of one")
-        if more := sorted(set(other["places"]) - set(training["places"])):  # type: ignore[call-overload]
-            raise SystemExit(f"{folder}: has seen {', '.join(more)} too; name that run first")
+    before = list[object]()
+    run: object = training
+    while isinstance(run, dict) and (run := run.get("start")):
+        before.append(run)
+    states, back = [net.state_dict()], list[int]()
+    for path in models:
+        earlier = notes_of(path)
+        if earlier not in before:
+            raise SystemExit(f"{path}: is none that this run went on from; name an export of one that it did")
+        other = network(str(training["network"]))
+        take_weights(folded(other), path)
+        states.append(other.state_dict())
+        back.append(before.index(earlier) + 1)
     net.load_state_dict({name: sum(state[name] for state in states) / len(states) for name in states[0]})
-    return net, {**training, "averaged_with": [other for _, other in others]}
+    return net, {**training, "averaged_with_runs_before": back}
 
 
 def main() -> None:
@@ -150,10 +155,12 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("folder", type=Path, help="the --out of training/train.py")
-    parser.add_argument("--average", nargs="+", default=[], metavar="RUN", type=Path, help=AVERAGE_HELP)
+    parser.add_argument("--average", nargs="+", default=[], metavar="MODEL", type=Path, help=AVERAGE_HELP)
     args = parser.parse_args()
     folder: Path = args.folder
-    net, training = averaged([folder, *args.average])
+    net, training = load(folder)
+    if args.average:
+        net, training = averaged(net, training, args.average)
     imagery = Path(os.environ.get("BUILDLOC_DATA", REPOSITORY / "../shared/data")) / "imagery"
     scenes = [scene for name in training["places"] for scene in place(imagery, name)]  # type: ignore[attr-defined]
     sampler = CropSampler(scenes, CropConfig(rendered_share=0.0, decoy_share=0.0), seed=0)

@@ -382,7 +382,7 @@ def _attached(canvas: Canvas, house: Wing) -> Wing:
     return _beside(house, offset * rng.choice((-1.0, 1.0), 2), long, wide)
 
 
-def _joined(canvas: Canvas, house: Wing) -> tuple[Wing, Wing]:
+def joined(canvas: Canvas, house: Wing) -> tuple[Wing, Wing]:
     """Another body of a house at some distance, and what joins the two."""
     rng, (_, length, width, _) = canvas.rng, house
     gap, long, wide = canvas.px(2.0, 6.0), length * rng.uniform(0.6, 1.1), width * rng.uniform(0.6, 1.1)
@@ -419,7 +419,7 @@ def building(canvas: Canvas, number: int, centre: Points, length: float, width: 
     wings, lower = [house], list[Wing]()
     form = rng.random()
     if form < 0.1:
-        other, link = _joined(canvas, house)
+        other, link = joined(canvas, house)
         wings.append(other)
         lower.append(link)
     elif form < 0.45:

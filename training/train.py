@@ -168,14 +168,19 @@ def scenes_of(places: list[str], imagery: Path) -> list[Scene]:
     return [scene for name in places for scene in scenes[name]]
 
 
-def started_from(model: Path, places: list[str]) -> dict[str, object]:
-    """How an exported network was trained. Raises SystemExit where it saw more ground than ``places``."""
+def notes_of(model: Path) -> dict[str, object]:
+    """How an exported network was trained. Raises SystemExit where its file does not say."""
     notes = {entry.key: entry.value for entry in onnx.load(str(model)).metadata_props}
     training: dict[str, object] = json.loads(notes.get("buildloc_training", "{}"))
-    seen = training.get("places")
-    if not isinstance(seen, list):
-        raise SystemExit(f"{model}: does not say what trained it; start from a file of training/export.py")
-    if missing := sorted(set(seen) - set(places)):
+    if not isinstance(training.get("places"), list):
+        raise SystemExit(f"{model}: does not say what trained it; give a file of training/export.py")
+    return training
+
+
+def started_from(model: Path, places: list[str]) -> dict[str, object]:
+    """The same. Raises SystemExit where it saw more ground than ``places``."""
+    training = notes_of(model)
+    if missing := sorted(set(training["places"]) - set(places)):  # type: ignore[call-overload]
         raise SystemExit(f"{model}: has seen {', '.join(missing)} too; add that to --places")
     return training
 

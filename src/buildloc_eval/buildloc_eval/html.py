@@ -34,8 +34,8 @@ def _cell(value: Any) -> str:
 
 
 def _entries(values: dict[str, Any]) -> str:
-    """Those that are alike, such as the bars of an evaluation, in one table, short side across; the others
-    follow."""
+    """Entries that are dicts of single values and have a key in common, such as the bars of an evaluation, as
+    one table, its longer side downwards; all others in a table of their own after it."""
     plain = {name: value for name, value in values.items() if _is_plain(value)}
     if len(plain) < 2 or not set.intersection(*map(set, plain.values())):
         return _table(values)

@@ -240,8 +240,8 @@ def evaluate(out: Path, plan: Plan, progress: Progress) -> str:
         progress("speed")
         speeds = speed(frame_jpeg(imagery), plan.speed, plan.config)
     bars = speed_bars(speeds)
-    for case in reports:
-        bars |= case_bars(case)
+    for one in reports:
+        bars |= case_bars(one)
     report = {
         "evaluation": "segmentation",
         "what is real": REAL,

@@ -34,16 +34,11 @@ def trained_on(network: Network) -> dict[str, Any] | None:
 
 
 def runs(training: dict[str, Any] | None) -> list[dict[str, Any]]:
-    """The runs of a training since the pretrained encoder, each after the one before; [] where not known.
-
-    Of one whose weights were averaged with those of others the number of these stays.
-    """
+    """The runs of a training since the pretrained encoder, each after the one before; [] where not known."""
     if training is None:
         return []
     before = training.get("start")
     own = {key: value for key, value in training.items() if key != "start"}
-    if "averaged_with" in own:
-        own["averaged_with"] = len(own["averaged_with"])
     return [*runs(before if isinstance(before, dict) else None), own]
 
 
@@ -51,8 +46,8 @@ def training_line(of_runs: Sequence[dict[str, Any]]) -> str:
     """For people: the steps of each run, and the ground of the last one, which is all of it."""
     if not of_runs:
         return "its file does not say what trained it"
-    steps = " + ".join(str(run.get("steps", "?")) for run in of_runs)
+    averaged = (" (averaged)" if "averaged_with_runs_before" in run else "" for run in of_runs)
+    steps = " + ".join(f"{run.get('steps', '?')}{mean}" for run, mean in zip(of_runs, averaged, strict=True))
     times = Counter(of_runs[-1]["places"])
     ground = ", ".join(name if n == 1 else f"{name} ({n} times)" for name, n in times.items())
-    last = ", averaged with earlier runs" if "averaged_with" in of_runs[-1] else ""
-    return f"{steps} steps on {ground}{last}"
+    return f"{steps} steps on {ground}"

@@ -31,9 +31,8 @@ def test_runs_come_in_order_and_their_line_names_the_ground_once() -> None:
     second = {"places": ["banepa", "zanzibar", "banepa"], "steps": 5}
     assert runs(second | {"start": first}) == [first, second]
     assert training_line([first, second]) == "3 + 5 steps on banepa (2 times), zanzibar"
-    mean = second | {"averaged_with": [first]}
-    assert runs(mean) == [second | {"averaged_with": 1}]
-    assert training_line(runs(mean)).endswith(", averaged with earlier runs")
+    mean = second | {"averaged_with_runs_before": [1]}
+    assert training_line([first, mean]).startswith("3 + 5 (averaged) steps on")
     assert runs(None) == [] and training_line([]) == "its file does not say what trained it"
 
 
