@@ -20,6 +20,7 @@ import onnx
 import onnxruntime
 import torch
 from buildloc_eval.places import place
+from buildloc_eval.trained_on import TRAINING_KEY, runs
 from crops import TRAIN_GSD_M, CropConfig, CropSampler
 from networks import CHANNELS, BuildingNet, SegFormer, folded, network, take_weights
 from numpy.typing import NDArray
@@ -61,9 +62,7 @@ def describe(path: Path, training: dict[str, object]) -> None:
     """Put the contract and the training into the file."""
     model = onnx.load(str(path))
     del model.metadata_props[:]
-    onnx.helper.set_model_props(
-        model, {"buildloc": json.dumps(CONTRACT), "buildloc_training": json.dumps(training)}
-    )
+    onnx.helper.set_model_props(model, {"buildloc": json.dumps(CONTRACT), TRAINING_KEY: json.dumps(training)})
     onnx.save(model, str(path))
 
 
@@ -132,21 +131,18 @@ def averaged(
 
     Raises SystemExit for any other network: the mean of unrelated weights says nothing.
     """
-    before = list[object]()
-    run: object = training
-    while isinstance(run, dict) and (run := run.get("start")):
-        before.append(run)
+    mine, mean = runs(training), folded(network(str(training["network"])))
     states, back = [net.state_dict()], list[int]()
     for path in models:
-        earlier = notes_of(path)
-        if earlier not in before:
+        theirs = runs(notes_of(path))
+        if theirs not in [mine[:count] for count in range(1, len(mine))]:
             raise SystemExit(f"{path}: is none that this run went on from; name an export of one that it did")
         other = network(str(training["network"]))
         take_weights(folded(other), path)
         states.append(other.state_dict())
-        back.append(before.index(earlier) + 1)
-    net.load_state_dict({name: sum(state[name] for state in states) / len(states) for name in states[0]})
-    return net, {**training, "averaged_with_runs_before": back}
+        back.append(len(mine) - len(theirs))
+    mean.load_state_dict({name: sum(state[name] for state in states) / len(states) for name in states[0]})
+    return mean.eval(), {**training, "averaged_with_runs_before": back}
 
 
 def main() -> None:

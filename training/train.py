@@ -13,11 +13,13 @@ import math
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 import cv2
 import onnx
 import torch
 from buildloc_eval.places import PLACES, Scene, place
+from buildloc_eval.trained_on import TrainingNotesError, trained_on
 from crops import CropConfig, CropSampler
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -168,19 +170,21 @@ def scenes_of(places: list[str], imagery: Path) -> list[Scene]:
     return [scene for name in places for scene in scenes[name]]
 
 
-def notes_of(model: Path) -> dict[str, object]:
+def notes_of(model: Path) -> dict[str, Any]:
     """How an exported network was trained. Raises SystemExit where its file does not say."""
-    notes = {entry.key: entry.value for entry in onnx.load(str(model)).metadata_props}
-    training: dict[str, object] = json.loads(notes.get("buildloc_training", "{}"))
-    if not isinstance(training.get("places"), list):
+    try:
+        training = trained_on({entry.key: entry.value for entry in onnx.load(str(model)).metadata_props})
+    except TrainingNotesError as error:
+        raise SystemExit(f"{model}: {error}") from error
+    if training is None:
         raise SystemExit(f"{model}: does not say what trained it; give a file of training/export.py")
     return training
 
 
-def started_from(model: Path, places: list[str]) -> dict[str, object]:
+def started_from(model: Path, places: list[str]) -> dict[str, Any]:
     """The same. Raises SystemExit where it saw more ground than ``places``."""
     training = notes_of(model)
-    if missing := sorted(set(training["places"]) - set(places)):  # type: ignore[call-overload]
+    if missing := sorted(set(training["places"]) - set(places)):
         raise SystemExit(f"{model}: has seen {', '.join(missing)} too; add that to --places")
     return training
 

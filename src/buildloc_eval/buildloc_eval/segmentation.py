@@ -170,7 +170,7 @@ class CaseResult:
 def run_case(case: Case, plan: Plan, imagery: Path, out: Path, progress: Progress) -> CaseResult:
     """Score a network on a place. Raises EvaluationError, PlaceError, NetworkError."""
     network = Network(replace(plan.config, model=case.model))
-    training = trained_on(network)
+    training = trained_on(network.metadata)
     refuse_known_ground(case, training)
     scenes: dict[str, Any] = {}
     pictures, everything, frames = [], list[Scored](), list[Overlap]()

@@ -81,7 +81,7 @@ def speed(jpeg: bytes, models: Sequence[str], config: SegmenterConfig) -> dict[s
         report[name] = {
             "ms": median, "ms_total": whole, "times the first": whole / first,
             "cpu_ms": float(np.median(busy[name])), "peak_memory_mb": memory,
-            "quantised": "quantised" in (trained_on(networks[name]) or {}),
+            "quantised": "quantised" in (trained_on(networks[name].metadata) or {}),
         }  # fmt: skip
     return report
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from buildloc_msgs_py.errors import BuildlocError
-from buildloc_segmenter.network import Network
 
 TRAINING_KEY = "buildloc_training"  # of the ONNX file's metadata: JSON with the places that trained it
 
@@ -17,9 +16,10 @@ class TrainingNotesError(BuildlocError):
     """A network's file does not say on which ground it was trained."""
 
 
-def trained_on(network: Network) -> dict[str, Any] | None:
-    """What trained a network; None when its file has no word of it. Raises TrainingNotesError."""
-    text = network.metadata.get(TRAINING_KEY)
+def trained_on(metadata: Mapping[str, str]) -> dict[str, Any] | None:
+    """What trained a network, by the metadata of its file; None when they have no word of it. Raises
+    TrainingNotesError."""
+    text = metadata.get(TRAINING_KEY)
     if text is None:
         return None
     try:

@@ -131,7 +131,7 @@ class Trained:
 def network_for(place: str, model: str) -> Trained:
     """Raises EvaluationError when that network was trained on the place, NetworkError when it is none."""
     network = Network(SegmenterConfig(model=model))
-    training = trained_on(network)
+    training = trained_on(network.metadata)
     refuse_known_ground(Case(place, model), training)
     return Trained(model, hashlib.sha256(network.path.read_bytes()).hexdigest(), training)
 
